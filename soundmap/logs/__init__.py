@@ -1,0 +1,1 @@
+"""From a recorded log to what the sensors measured."""

@@ -1,0 +1,58 @@
+"""One run: everything that processing a log yields, before any of it is written."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from soundmap.config import Config
+from soundmap.geometry import Trajectory
+from soundmap.grid import OccupancyGrid
+from soundmap.losses import Loss
+from soundmap.sound import AudioScans, PowerMap, SourceList
+
+
+@dataclass(frozen=True)
+class Run:
+    """The results of ``soundmap process`` for one log.
+
+    Attributes
+    ----------
+    log : Path
+        The log as the user named it.
+    fingerprint : str
+        Identifies the log's content.
+    config : Config
+        As resolved.
+    room : OccupancyGrid
+        The geometric map used (Sect. 2.1).
+    trajectory : Trajectory
+        Base frame in the map frame, one pose a laser scan used (Sect. 2.2).
+    scans : AudioScans
+        Sect. 2.3.
+    power_map : PowerMap
+        Sect. 2.4.
+    sources : SourceList
+        Sects. 2.4 and 4.
+    losses : tuple of Loss
+        What had to be left out.
+    counts : dict
+        How much of what was used, by name.
+    timings_s : dict
+        Wall time of each stage [s].
+    duration_s : float
+        Time from the first to the last message of the log [s].
+    """
+
+    log: Path
+    fingerprint: str
+    config: Config
+    room: OccupancyGrid
+    trajectory: Trajectory
+    scans: AudioScans
+    power_map: PowerMap
+    sources: SourceList
+    losses: tuple[Loss, ...]
+    counts: dict[str, int]
+    timings_s: dict[str, float]
+    duration_s: float

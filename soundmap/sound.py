@@ -1,0 +1,201 @@
+"""What is heard, and where it comes from: audio scans, power maps, sources."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soundmap.geometry import FloatArray
+from soundmap.grid import GridFrame
+
+REFERENCE_PRESSURE_PA = 20e-6
+
+
+class LevelReference(StrEnum):
+    """What a power of 1 (0 dB) stands for."""
+
+    FULL_SCALE = "dB re (full scale)^2"
+    SOUND_PRESSURE = "dB re (20 uPa)^2"
+
+
+def decibels(power: FloatArray | float) -> FloatArray:
+    """10 log10 of a power; -inf for 0, NaN for NaN, without a warning."""
+    with np.errstate(divide="ignore"):
+        return np.asarray(10.0 * np.log10(power), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class AudioScan:
+    r"""Steered response power over all bearings, averaged over about 100 ms.
+
+    Attributes
+    ----------
+    time_ns : int
+        Middle of the scan [ns since epoch].
+    bearing_rad : ndarray, shape (N,)
+        :math:`\theta_n`, counter-clockwise in the array's frame, in [0, 2 pi) [rad].
+    power : ndarray, shape (N,)
+        :math:`J_n`, mean square of the beamformer output over the band [linear].
+    """
+
+    time_ns: int
+    bearing_rad: FloatArray
+    power: FloatArray
+
+    def __post_init__(self) -> None:
+        if self.power.shape != self.bearing_rad.shape:
+            raise ValueError("an audio scan needs one power a bearing")
+
+
+@dataclass(frozen=True)
+class AudioScans:
+    """All audio scans of a run, as kept.
+
+    Attributes
+    ----------
+    time_ns : ndarray of int64, shape (S,)
+        Middle of each scan [ns since epoch].
+    bearing_rad : ndarray, shape (N,)
+        In the array's frame [rad].
+    power : ndarray of float32, shape (S, N)
+        [linear].
+    reference : LevelReference
+    """
+
+    time_ns: NDArray[np.int64]
+    bearing_rad: FloatArray
+    power: NDArray[np.float32]
+    reference: LevelReference
+
+    def __post_init__(self) -> None:
+        if self.power.shape != (len(self.time_ns), len(self.bearing_rad)):
+            raise ValueError("audio scans need one power a time and bearing")
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
+
+
+@dataclass(frozen=True)
+class PowerMap:
+    """Mean emitted power of the surfaces, and how often each cell was visited. Eqs. (4)-(5).
+
+    Attributes
+    ----------
+    frame : GridFrame
+    power_sum : ndarray, shape (H, W)
+        :math:`P_{ij} K_{ij}`, sum of the shares that each cell received [linear]. Sums and
+        visits of two runs add up to those of both.
+    visits : ndarray of int64, shape (H, W)
+        :math:`K_{ij}`.
+    reference : LevelReference
+    """
+
+    frame: GridFrame
+    power_sum: FloatArray
+    visits: NDArray[np.int64]
+    reference: LevelReference
+
+    def __post_init__(self) -> None:
+        if self.power_sum.shape != self.frame.shape or self.visits.shape != self.frame.shape:
+            raise ValueError("a power map needs one sum and one count a cell")
+
+    def power(self, *, min_visit_share: float = 0.0) -> FloatArray:
+        """:math:`P_{ij}`, shape (H, W) [linear]; NaN where not measured or visited too rarely.
+
+        A cell counts when :math:`K_{ij}` is greater than ``min_visit_share`` of the greatest
+        count (Sect. 4 uses 0.1).
+        """
+        seen = self.visits > min_visit_share * self.visits.max(initial=0)
+        seen &= self.visits > 0
+        with np.errstate(invalid="ignore"):
+            return np.where(seen, self.power_sum / np.maximum(self.visits, 1), np.nan)
+
+
+@dataclass(frozen=True)
+class Source:
+    """A local maximum of the power map.
+
+    Attributes
+    ----------
+    x_m, y_m : float
+        Position in the map frame [m].
+    power : float
+        :math:`P_{ij}` there [linear].
+    visits : int
+        :math:`K_{ij}` there.
+    """
+
+    x_m: float
+    y_m: float
+    power: float
+    visits: int
+
+
+@dataclass(frozen=True)
+class SourceList:
+    """Sources, loudest first. Without any source it is empty, not None.
+
+    Attributes
+    ----------
+    sources : tuple of Source
+    reference : LevelReference
+        What their power refers to.
+    """
+
+    sources: tuple[Source, ...]
+    reference: LevelReference
+
+    def __iter__(self) -> Iterator[Source]:
+        return iter(self.sources)
+
+    def __len__(self) -> int:
+        return len(self.sources)
+
+
+@dataclass(frozen=True)
+class Change:
+    """A place that is louder in one run than in another.
+
+    Attributes
+    ----------
+    x_m, y_m : float
+        Position in the map frame [m].
+    ratio_db : float
+        Power of the run over that of the background [dB].
+    visits : int
+        Visits of the cell in the run.
+    """
+
+    x_m: float
+    y_m: float
+    ratio_db: float
+    visits: int
+
+
+@dataclass(frozen=True)
+class PowerRatio:
+    """Difference of two power maps in dB, Sect. 4 and Fig. 7.
+
+    Attributes
+    ----------
+    frame : GridFrame
+        That of the run.
+    ratio_db : ndarray, shape (H, W)
+        Power of the run over that of the background [dB]; NaN where the run did not measure.
+    visits : ndarray of int64, shape (H, W)
+        Visits in the run.
+    background_measured : ndarray of bool, shape (H, W)
+        Where the background has a measurement of its own; elsewhere its median stands in.
+    changes : tuple of Change
+        Local maxima, greatest ratio first.
+    """
+
+    frame: GridFrame
+    ratio_db: FloatArray
+    visits: NDArray[np.int64]
+    background_measured: NDArray[np.bool_]
+    changes: tuple[Change, ...]
