@@ -1,0 +1,176 @@
+"""Where in the map the robot may be, when nobody says: correlative search over all poses.
+
+The end points of the laser rays are laid over the map at every place and heading, and scored by
+how near they come to its surfaces (Olson, "Real-time correlative scan matching", ICRA 2009). The
+best poses, several where the site looks alike in several places, seed the particle filter.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from soundmap.deskew import Rays
+from soundmap.geometry import FloatArray, wrapped_angle
+from soundmap.grid import OccupancyGrid
+from soundmap.localize.particles import MODE_RADIUS_M, MODE_RADIUS_RAD
+
+COARSE_STEP_M = 0.2
+COARSE_HEADINGS = 72
+COARSE_SIGMA_M = 0.25
+FINE_SIGMA_M = 0.10
+CANDIDATES = 3000
+MODES = 40
+SCORE_MARGIN = 0.25
+"""A pose whose score is this much (of 1) below the best is no hypothesis."""
+CLEARANCE_M = 0.15
+"""The base stands at least this far from every wall."""
+
+
+def start_hypotheses(room: OccupancyGrid, rays: Rays) -> tuple[FloatArray, FloatArray]:
+    """Poses of the base from which the map looks like the scan, best first.
+
+    Parameters
+    ----------
+    room : OccupancyGrid
+    rays : Rays
+        Of one or several scanners, in one base frame.
+
+    Returns
+    -------
+    pose : ndarray, shape (K, 3)
+        [m, m, rad], K <= 40; K = 0 if the map has no place for a robot.
+    score : ndarray, shape (K,)
+        Between 0 and 1.
+    """
+    distance = _distance_to_wall(room)
+    places = _places(room, distance)
+    if len(places) == 0 or len(rays) == 0:
+        return np.empty((0, 3)), np.empty(0)
+    heading = np.linspace(-np.pi, np.pi, COARSE_HEADINGS, endpoint=False)
+    grid = (distance, np.array(room.frame.origin_m), room.frame.resolution_m)
+    coarse = _place_scores(*grid, places, heading, rays.end_m, COARSE_SIGMA_M)
+    best = np.argsort(coarse, axis=None)[::-1][:CANDIDATES]
+    place, turn = np.unravel_index(best, coarse.shape)
+    pose = np.column_stack([places[place], heading[turn]])
+    for step_m in (0.1, 0.05, 0.025):
+        pose, score = _climbed(grid, pose, rays.end_m, step_m)
+    return _separate_modes(pose, score)
+
+
+def _distance_to_wall(room: OccupancyGrid) -> NDArray[np.float32]:
+    from scipy.ndimage import distance_transform_edt
+
+    distance = distance_transform_edt(~room.occupied) * room.frame.resolution_m
+    return np.asarray(distance, dtype=np.float32)
+
+
+def _places(room: OccupancyGrid, distance: NDArray[np.float32]) -> FloatArray:
+    """Positions about `COARSE_STEP_M` apart where a robot has room, shape (P, 2)."""
+    stride = max(1, round(COARSE_STEP_M / room.frame.resolution_m))
+    open_space = room.free if room.free.any() else ~room.occupied
+    for clearance in (CLEARANCE_M, 0.0):
+        fits = open_space & (distance > clearance)
+        coarse = np.zeros_like(fits)
+        coarse[::stride, ::stride] = fits[::stride, ::stride]
+        if coarse.any():
+            return room.frame.centres(np.argwhere(coarse))
+    return np.empty((0, 2))
+
+
+def _climbed(
+    grid: tuple[NDArray[np.float32], FloatArray, float],
+    pose: FloatArray,
+    points: FloatArray,
+    step_m: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Each pose moved to the best of its 27 neighbours, and the score there."""
+    steps = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 3)
+    # At 3 m, a usual range, a turn of step / 3 m moves the end points as far as a step does.
+    offset = steps * np.array([step_m, step_m, step_m / 3.0])
+    around = (pose[:, None, :] + offset).reshape(-1, 3)
+    score = _pose_scores(*grid, around, points, FINE_SIGMA_M).reshape(len(pose), -1)
+    best = np.argmax(score, axis=1)
+    chosen = around.reshape(len(pose), -1, 3)[np.arange(len(pose)), best]
+    chosen[:, 2] = wrapped_angle(chosen[:, 2])
+    return chosen, score.max(axis=1)
+
+
+def _separate_modes(pose: FloatArray, score: FloatArray) -> tuple[FloatArray, FloatArray]:
+    order = np.argsort(score)[::-1]
+    pose, score = pose[order], score[order]
+    kept: list[int] = []
+    for index in np.flatnonzero(score >= score[0] - SCORE_MARGIN):
+        offset = pose[kept] - pose[index]
+        near = np.hypot(offset[:, 0], offset[:, 1]) < 0.5 * MODE_RADIUS_M
+        if not np.any(near & (np.abs(wrapped_angle(offset[:, 2])) < 0.5 * MODE_RADIUS_RAD)):
+            kept.append(int(index))
+        if len(kept) == MODES:
+            break
+    return pose[kept], score[kept]
+
+
+@njit(cache=True, nogil=True)
+def _nearness(
+    distance: NDArray[np.float32],
+    origin: FloatArray,
+    resolution: float,
+    x: float,
+    y: float,
+    heading: float,
+    points: FloatArray,
+    sigma: float,
+) -> float:
+    """Mean over the points of exp(-d^2 / 2 sigma^2), d the distance to the nearest wall."""
+    rows, columns = distance.shape
+    cos, sin = np.cos(heading), np.sin(heading)
+    factor = -0.5 / (sigma * sigma)
+    total = 0.0
+    for point in range(len(points)):
+        column = int(
+            np.floor((x + cos * points[point, 0] - sin * points[point, 1] - origin[0]) / resolution)
+        )
+        row = int(
+            np.floor((y + sin * points[point, 0] + cos * points[point, 1] - origin[1]) / resolution)
+        )
+        if 0 <= row < rows and 0 <= column < columns:
+            d = distance[row, column]
+            total += np.exp(factor * d * d)
+    return total / len(points)
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _place_scores(
+    distance: NDArray[np.float32],
+    origin: FloatArray,
+    resolution: float,
+    places: FloatArray,
+    heading: FloatArray,
+    points: FloatArray,
+    sigma: float,
+) -> FloatArray:
+    score = np.empty((len(places), len(heading)))
+    for place in prange(len(places)):
+        x, y = places[place]
+        for turn in range(len(heading)):
+            score[place, turn] = _nearness(
+                distance, origin, resolution, x, y, heading[turn], points, sigma
+            )
+    return score
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _pose_scores(
+    distance: NDArray[np.float32],
+    origin: FloatArray,
+    resolution: float,
+    pose: FloatArray,
+    points: FloatArray,
+    sigma: float,
+) -> FloatArray:
+    score = np.empty(len(pose))
+    for index in prange(len(pose)):
+        x, y, heading = pose[index]
+        score[index] = _nearness(distance, origin, resolution, x, y, heading, points, sigma)
+    return score
