@@ -167,6 +167,10 @@ class ScanConfig(Table):
 class FuseConfig(Table):
     """Emitted power and its accumulation, Sect. 2.4 and Table 1."""
 
+    candidates: Literal["bearings", "peaks"] = "peaks"
+    """Which bearings of a scan may be its strongest candidate. "bearings": all, as in the paper;
+    "peaks": only local maxima over the bearings, interpolated between them. Eq. (3) otherwise
+    favours the flank of a peak that points past the source at a farther wall."""
     cell_m: Positive = 0.05
     """Edge of a cell of the power map [m]."""
     alpha: NotNegative = 0.5

@@ -50,6 +50,35 @@ class AudioScan:
         if self.power.shape != self.bearing_rad.shape:
             raise ValueError("an audio scan needs one power a bearing")
 
+    def peaks(self) -> tuple[FloatArray, FloatArray]:
+        """Local maxima over the circle, finer than the bearings are spaced.
+
+        Each is the vertex of the parabola through a bearing that is louder than both of its
+        neighbours and those two.
+
+        Returns
+        -------
+        bearing_rad : ndarray, shape (P,)
+            In the array's frame [rad], loudest first.
+        power : ndarray, shape (P,)
+            [linear]
+
+        Examples
+        --------
+        >>> bearing = np.radians([0.0, 90.0, 180.0, 270.0])
+        >>> scan = AudioScan(0, bearing, np.array([3.0, 2.0, 0.0, 1.0]))
+        >>> np.degrees(scan.peaks()[0]).round(3).tolist()
+        [15.0]
+        """
+        before, after = np.roll(self.power, 1), np.roll(self.power, -1)
+        tops = np.flatnonzero((self.power > before) & (self.power >= after))
+        tops = tops[np.argsort(-self.power[tops], kind="stable")]
+        before, here, after = before[tops], self.power[tops], after[tops]
+        offset = 0.5 * (before - after) / (before - 2.0 * here + after)
+        spacing = 2.0 * np.pi / len(self.power)
+        bearing = (self.bearing_rad[tops] + offset * spacing) % (2.0 * np.pi)
+        return bearing, here - 0.25 * (before - after) * offset
+
 
 @dataclass(frozen=True)
 class AudioScans:
