@@ -1,0 +1,152 @@
+"""What was done, with what, at which cost: ``report.json``, and the rows of ``sources.csv``."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import importlib.metadata
+import io
+import json
+import math
+import platform
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from soundmap import __version__
+from soundmap.config import DiffConfig
+from soundmap.geometry import Trajectory
+from soundmap.run import Run
+from soundmap.sound import Change, PowerRatio, SourceList, decibels
+
+SCHEMA_VERSION = 1
+SOURCE_COLUMNS = ("id", "x_m", "y_m", "power_db", "visits", "power_reference")
+CHANGE_COLUMNS = ("id", "x_m", "y_m", "ratio_db", "visits")
+LIBRARIES = ("numpy", "scipy", "numba", "matplotlib", "mcap", "rosbags", "pydantic")
+
+
+def run_report(run: Run, timings_s: Mapping[str, float]) -> dict[str, Any]:
+    """Everything about a run but its arrays, in the order in which a person asks.
+
+    Parameters
+    ----------
+    run : Run
+    timings_s : mapping
+        Wall time of each stage, writing included [s].
+    """
+    spent = sum(timings_s.values())
+    return {
+        **_provenance(),
+        "log": run.log.name,
+        "fingerprint": run.fingerprint,
+        "duration_s": run.duration_s,
+        "speed": run.duration_s / spent if spent > 0 else None,
+        "level_reference": str(run.sources.reference),
+        "sources": source_rows(run.sources),
+        "trajectory": _trajectory_summary(run.trajectory),
+        "counts": dict(run.counts),
+        "losses": [dataclasses.asdict(loss) for loss in run.losses],
+        "timings_s": dict(timings_s),
+        "config": run.config.model_dump(mode="json", exclude_none=True),
+    }
+
+
+def diff_report(
+    ratio: PowerRatio,
+    *,
+    run: Path,
+    background: Path,
+    config: DiffConfig,
+    timings_s: Mapping[str, float],
+) -> dict[str, Any]:
+    """Everything about a comparison of two runs but its arrays."""
+    measured = np.isfinite(ratio.ratio_db)
+    return {
+        **_provenance(),
+        "run": run.resolve().name,
+        "background": background.resolve().name,
+        "sources": change_rows(ratio.changes),
+        "counts": {
+            "cells_compared": int(measured.sum()),
+            "cells_without_background": int((measured & ~ratio.background_measured).sum()),
+        },
+        "timings_s": dict(timings_s),
+        "config": {"diff": config.model_dump(mode="json", exclude_none=True)},
+    }
+
+
+def source_rows(sources: SourceList) -> list[dict[str, Any]]:
+    """One row a source, loudest first, named S1, S2, ...; as in the CSV and in the report."""
+    return [
+        {
+            "id": f"S{number}",
+            "x_m": round(source.x_m, 4),
+            "y_m": round(source.y_m, 4),
+            "power_db": _finite(round(float(decibels(source.power)), 3)),
+            "visits": source.visits,
+            "power_reference": str(sources.reference),
+        }
+        for number, source in enumerate(sources, start=1)
+    ]
+
+
+def change_rows(changes: Sequence[Change]) -> list[dict[str, Any]]:
+    """One row a change, greatest ratio first, named S1, S2, ..."""
+    return [
+        {
+            "id": f"S{number}",
+            "x_m": round(change.x_m, 4),
+            "y_m": round(change.y_m, 4),
+            "ratio_db": _finite(round(change.ratio_db, 3)),
+            "visits": change.visits,
+        }
+        for number, change in enumerate(changes, start=1)
+    ]
+
+
+def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
+    """A table with a header row; missing values are empty, lines end in a newline alone."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def json_text(content: Mapping[str, Any]) -> str:
+    """Strict JSON: numpy's scalars as numbers, paths as text, what is not finite as null."""
+    return json.dumps(_plain(content), indent=2, allow_nan=False)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, Path):
+        return str(value)
+    return _finite(value) if isinstance(value, float) else value
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _provenance() -> dict[str, Any]:
+    versions = {"python": platform.python_version()}
+    for library in LIBRARIES:
+        versions[library] = importlib.metadata.version(library)
+    return {"schema_version": SCHEMA_VERSION, "soundmap": __version__, "versions": versions}
+
+
+def _trajectory_summary(trajectory: Trajectory) -> dict[str, Any]:
+    steps = np.diff(trajectory.pose[:, :2], axis=0)
+    return {
+        "poses": len(trajectory),
+        "length_m": float(np.hypot(steps[:, 0], steps[:, 1]).sum()),
+        "usable_share": float(trajectory.usable.mean()) if len(trajectory) else None,
+    }

@@ -1,0 +1,239 @@
+"""The folder of a run, and that of a difference of two runs: writing both, reading power maps."""
+
+from __future__ import annotations
+
+import time
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from soundmap.config import DiffConfig, config_toml
+from soundmap.errors import LogError
+from soundmap.geometry import FloatArray, Trajectory
+from soundmap.grid import GridFrame, OccupancyGrid
+from soundmap.map_file import map_files
+from soundmap.outputs.new_folder import REPORT, writing
+from soundmap.outputs.report import (
+    CHANGE_COLUMNS,
+    SCHEMA_VERSION,
+    SOURCE_COLUMNS,
+    csv_text,
+    diff_report,
+    json_text,
+    run_report,
+)
+from soundmap.run import Run
+from soundmap.sound import AudioScans, LevelReference, PowerMap, PowerRatio
+
+POWER_MAP = "power_map.npz"
+
+
+def write_run(run: Run, folder: Path) -> dict[str, Any]:
+    """Write everything that a run yields into an empty folder.
+
+    Returns
+    -------
+    dict
+        The report, as in ``report.json``.
+    """
+    from soundmap.outputs import figures  # matplotlib is slow to load
+
+    start = time.perf_counter()
+    share = run.config.detect.min_visit_share
+    with writing(folder):
+        (folder / "trajectory.tum").write_text(tum_text(run.trajectory), encoding="ascii")
+        write_arrays(folder / POWER_MAP, power_map_arrays(run.power_map, min_visit_share=share))
+        write_arrays(folder / "audio_scans.npz", _audio_scan_arrays(run.scans))
+        _write_map(folder, run.room)
+        (folder / "config.toml").write_text(config_toml(run.config), encoding="utf-8")
+        figures.write_trajectory(folder / "trajectory.png", run)
+        figures.write_power_map(folder / "power_map.png", run)
+        figures.write_audio_scans(folder / "audio_scans.png", run)
+        report = run_report(run, {**run.timings_s, "outputs": time.perf_counter() - start})
+        _write_tables(folder, SOURCE_COLUMNS, report)
+    return report
+
+
+def write_diff(
+    ratio: PowerRatio,
+    folder: Path,
+    *,
+    room: OccupancyGrid | None,
+    run: Path,
+    background: Path,
+    config: DiffConfig,
+    timings_s: Mapping[str, float],
+) -> dict[str, Any]:
+    """Write the difference of two runs into an empty folder.
+
+    Parameters
+    ----------
+    ratio : PowerRatio
+    folder : Path
+    room : OccupancyGrid or None
+        The geometric map, if known.
+    run, background : Path
+        The run folders that were compared.
+    config : DiffConfig
+    timings_s : mapping
+        Wall time of each stage so far [s].
+
+    Returns
+    -------
+    dict
+        The report, as in ``report.json``.
+    """
+    from soundmap.outputs import figures
+
+    start = time.perf_counter()
+    with writing(folder):
+        write_arrays(folder / "power_ratio.npz", _power_ratio_arrays(ratio))
+        if room is not None:
+            _write_map(folder, room)
+        title = f"{run.resolve().name} against {background.resolve().name}"
+        figures.write_power_ratio(folder / "power_ratio.png", ratio, room=room, title=title)
+        report = diff_report(
+            ratio,
+            run=run,
+            background=background,
+            config=config,
+            timings_s={**timings_s, "outputs": time.perf_counter() - start},
+        )
+        _write_tables(folder, CHANGE_COLUMNS, report)
+    return report
+
+
+def tum_text(trajectory: Trajectory) -> str:
+    r"""One line a pose: ``timestamp tx ty tz qx qy qz qw``, seconds exact to the nanosecond.
+
+    Examples
+    --------
+    >>> pose = np.array([[1.0, 2.0, np.pi]])
+    >>> tum_text(Trajectory(np.array([1700000000000000007]), pose, np.array([True])))
+    '1700000000.000000007 1.000000 2.000000 0 0 0 1.000000000 0.000000000\n'
+    """
+    half = trajectory.pose[:, 2] / 2.0
+    rows = zip(
+        trajectory.time_ns.tolist(),
+        trajectory.pose[:, :2].tolist(),
+        np.sin(half).tolist(),
+        np.cos(half).tolist(),
+        strict=True,
+    )
+    return "".join(
+        f"{_seconds(ns)} {x:z.6f} {y:z.6f} 0 0 0 {qz:z.9f} {qw:z.9f}\n"
+        for ns, (x, y), qz, qw in rows
+    )
+
+
+def power_map_arrays(power_map: PowerMap, *, min_visit_share: float) -> dict[str, ArrayLike]:
+    """Content of ``power_map.npz``: what people read, and the sums that merge exactly."""
+    return {
+        "power": power_map.power(min_visit_share=min_visit_share),
+        "visits": power_map.visits,
+        **_frame_arrays(power_map.frame),
+        "power_sum": power_map.power_sum,
+        "min_visit_share": min_visit_share,
+        "reference": str(power_map.reference),
+        "power_unit": str(power_map.reference).removeprefix("dB re "),
+        "schema_version": SCHEMA_VERSION,
+    }
+
+
+def read_power_map(folder: Path) -> tuple[PowerMap, float]:
+    """Power map of a run folder, and the share of the greatest visits that a cell has to exceed.
+
+    Raises
+    ------
+    LogError
+        Not a run folder, a damaged one, or one of a newer soundmap.
+    """
+    file = folder / POWER_MAP
+    if not file.is_file():
+        raise LogError(
+            f"{folder}: no run folder: it holds no {POWER_MAP}. Give the folder that "
+            "`soundmap process` wrote."
+        )
+    damaged = f"{file}: cannot be read as a power map"
+    try:
+        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
+            version = int(stored["schema_version"])
+            if version > SCHEMA_VERSION:
+                raise LogError(
+                    f"{file}: written by a newer soundmap (schema {version}; this one reads up to "
+                    f"{SCHEMA_VERSION}). Update soundmap, or process the log again."
+                )
+            return _stored_power_map(stored), float(stored["min_visit_share"])
+    except KeyError as error:
+        raise LogError(f"{damaged}: {error.args[0]}. Process the log again.") from None
+    except (OSError, ValueError, TypeError, EOFError, MemoryError) as error:
+        raise LogError(f"{damaged}: {error}. Process the log again.") from None
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError) as error:
+        raise LogError(f"{damaged}: damaged file ({error}). Process the log again.") from None
+
+
+def write_arrays(file: Path, arrays: Mapping[str, ArrayLike]) -> None:
+    """Write an NPZ archive; equal arrays give equal bytes, whenever they are written."""
+    content: dict[str, Any] = {name: np.asarray(array) for name, array in arrays.items()}
+    np.savez_compressed(file, **content)
+
+
+def _stored_power_map(stored: Mapping[str, NDArray[Any]]) -> PowerMap:
+    visits, power_sum = stored["visits"], stored["power_sum"]
+    if visits.ndim != 2 or not np.issubdtype(visits.dtype, np.integer):
+        raise ValueError("visits should be whole numbers in two dimensions")
+    if np.any(visits < 0) or not np.all(np.isfinite(power_sum)):
+        raise ValueError("sums should be finite and visits not negative")
+    x, y = (float(value) for value in stored["origin_m"])
+    resolution = float(stored["resolution_m"])
+    if not np.all(np.isfinite([x, y, resolution])):
+        raise ValueError("the grid has no finite place")
+    frame = GridFrame(resolution, (x, y), (visits.shape[0], visits.shape[1]))
+    reference = LevelReference(str(stored["reference"]))
+    return PowerMap(frame, power_sum.astype(np.float64), visits.astype(np.int64), reference)
+
+
+def _audio_scan_arrays(scans: AudioScans) -> dict[str, ArrayLike]:
+    return {
+        "time_ns": scans.time_ns,
+        "bearing_rad": scans.bearing_rad,
+        "power": scans.power.astype(np.float32, copy=False),
+        "reference": str(scans.reference),
+        "schema_version": SCHEMA_VERSION,
+    }
+
+
+def _power_ratio_arrays(ratio: PowerRatio) -> dict[str, ArrayLike]:
+    return {
+        "ratio_db": ratio.ratio_db,
+        "visits": ratio.visits,
+        "background_measured": ratio.background_measured,
+        **_frame_arrays(ratio.frame),
+        "schema_version": SCHEMA_VERSION,
+    }
+
+
+def _frame_arrays(frame: GridFrame) -> dict[str, ArrayLike]:
+    origin: FloatArray = np.asarray(frame.origin_m, dtype=np.float64)
+    return {"resolution_m": frame.resolution_m, "origin_m": origin}
+
+
+def _seconds(time_ns: int) -> str:
+    whole, rest = divmod(abs(time_ns), 1_000_000_000)
+    return f"{'-' if time_ns < 0 else ''}{whole}.{rest:09d}"
+
+
+def _write_map(folder: Path, room: OccupancyGrid) -> None:
+    for name, content in map_files(room).items():
+        (folder / name).write_bytes(content)
+
+
+def _write_tables(folder: Path, columns: tuple[str, ...], report: Mapping[str, Any]) -> None:
+    rows = report["sources"]
+    (folder / "sources.csv").write_text(csv_text(columns, rows), encoding="utf-8")
+    (folder / REPORT).write_text(json_text(report) + "\n", encoding="utf-8")
