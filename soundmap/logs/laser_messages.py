@@ -1,0 +1,119 @@
+"""Bearings and ranges out of one laser message, whatever its layout."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from soundmap.geometry import FloatArray
+from soundmap.logs.messages import Form, frame_name, ros_stamp_ns, timestamp_ns
+from soundmap.logs.schemas import MessageError
+
+Pose7 = tuple[float, float, float, float, float, float, float]
+
+
+class LaserSweep(NamedTuple):
+    """One laser message.
+
+    Attributes
+    ----------
+    stamp_ns : int
+        Time of the first ray; 0 if there is none.
+    frame_id : str
+    first_angle_rad, angle_step_rad : float
+        Bearing of the first ray and from one ray to the next.
+    ray_interval_s : float
+        0 if the message does not tell.
+    range_min_m, range_max_m : float
+        Limits of the ranges that the scanner can measure; NaN if the message does not tell.
+    ranges : array_like
+        As recorded.
+    pose : tuple or None
+        x, y, z, qx, qy, qz, qw of the scanner in its frame, if it is not the frame itself.
+    """
+
+    stamp_ns: int
+    frame_id: str
+    first_angle_rad: float
+    angle_step_rad: float
+    ray_interval_s: float
+    range_min_m: float
+    range_max_m: float
+    ranges: Any
+    pose: Pose7 | None
+
+
+def valid_ranges(sweep: LaserSweep) -> FloatArray:
+    """Distances [m], shape (R,); NaN where there is no return.
+
+    No return is what a scanner reports as NaN, infinite, nought, or outside its own limits.
+    """
+    ranges = np.array(sweep.ranges, dtype=np.float64)
+    low = max(sweep.range_min_m, 0.0) if np.isfinite(sweep.range_min_m) else 0.0
+    high = sweep.range_max_m if np.isfinite(sweep.range_max_m) else np.inf
+    if not high > low:
+        low, high = 0.0, np.inf
+    with np.errstate(invalid="ignore"):
+        ranges[~((ranges > 0.0) & (ranges >= low) & (ranges < high))] = np.nan
+    return ranges
+
+
+def _step(first: float, last: float, step: float, count: int) -> float:
+    """Angle between rays, from the ends of the sweep if the message does not tell it."""
+    if np.isfinite(step) and (step != 0.0 or count < 2):
+        return step
+    return (last - first) / (count - 1) if count > 1 else 0.0
+
+
+def _laser_scan(message: Any) -> LaserSweep:
+    first, last = float(message.angle_min), float(message.angle_max)
+    step = _step(first, last, float(message.angle_increment), len(message.ranges))
+    if not (np.isfinite(first) and np.isfinite(step)):
+        raise MessageError("laser scan without sound angles")
+    interval = float(message.time_increment)
+    return LaserSweep(
+        ros_stamp_ns(message.header.stamp),
+        frame_name(message.header.frame_id),
+        first,
+        step,
+        interval if np.isfinite(interval) else 0.0,
+        float(message.range_min),
+        float(message.range_max),
+        message.ranges,
+        None,
+    )
+
+
+def _angle_range_scan(message: Any) -> LaserSweep:
+    first, last, count = float(message.start_angle), float(message.end_angle), len(message.ranges)
+    step = _step(first, last, 0.0, count)
+    if not (np.isfinite(first) and np.isfinite(step)):
+        raise MessageError("laser scan without sound angles")
+    pose = None
+    if hasattr(message, "pose"):
+        p, q = message.pose.position, message.pose.orientation
+        given = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
+        if not np.all(np.isfinite(given)):
+            raise MessageError("laser scan without a sound pose")
+        # A pose that was never set is all zeros.
+        pose = (*given[:3], *(given[3:] if any(given[3:]) else (0.0, 0.0, 0.0, 1.0)))
+    return LaserSweep(
+        timestamp_ns(message.timestamp),
+        frame_name(message.frame_id),
+        first,
+        step,
+        0.0,
+        np.nan,
+        np.nan,
+        message.ranges,
+        pose,
+    )
+
+
+SWEEP_READERS: dict[Form, Callable[[Any], LaserSweep]] = {
+    Form.LASER_SCAN: _laser_scan,
+    Form.ANGLE_RANGE_SCAN: _angle_range_scan,
+}
+"""What turns a decoded message of each layout into a sweep."""

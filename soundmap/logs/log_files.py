@@ -1,0 +1,99 @@
+"""Which MCAP files make up a log: one file, or the splits of a rosbag2 folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from soundmap.errors import LogError
+
+
+def log_files(path: Path) -> tuple[Path, ...]:
+    """The MCAP files of a log in the order they were recorded.
+
+    Parameters
+    ----------
+    path : Path
+        An ``.mcap`` file, or a rosbag2 folder with ``metadata.yaml`` and the splits it names.
+
+    Raises
+    ------
+    LogError
+        Nothing is there, or the folder cannot be understood.
+    """
+    if path.is_dir():
+        return _splits(path)
+    if not path.exists():
+        raise LogError(f"{path}: no such file or folder. Check the path.")
+    return (path,)
+
+
+def _splits(folder: Path) -> tuple[Path, ...]:
+    metadata = folder / "metadata.yaml"
+    if not metadata.is_file():
+        found = sorted(file.name for file in folder.glob("*.mcap"))
+        if not found:
+            raise LogError(
+                f"{folder}: a folder without metadata.yaml and without .mcap files. "
+                "Give an .mcap file or a rosbag2 folder."
+            )
+        raise LogError(
+            f"{folder}: a folder with {len(found)} .mcap file(s) but no metadata.yaml. Give one "
+            f"file ({folder / found[0]}), or restore metadata.yaml: ros2 bag reindex -s mcap "
+            f"{folder}"
+        )
+    information = _bag_information(metadata)
+    _refuse_compression(folder, information)
+    names = information.get("relative_file_paths")
+    if not isinstance(names, list) or not names or not all(isinstance(n, str) for n in names):
+        raise LogError(f"{metadata}: names no files (relative_file_paths). Is it a rosbag2 folder?")
+    return tuple(_inside(folder, name) for name in names)
+
+
+def _bag_information(metadata: Path) -> dict[str, Any]:
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    try:
+        content = YAML(typ="safe", pure=True).load(metadata.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, YAMLError, ValueError) as error:
+        first_line = (str(error) or type(error).__name__).splitlines()[0]
+        raise LogError(f"{metadata}: cannot be read ({first_line}).") from None
+    information = content.get("rosbag2_bagfile_information") if isinstance(content, dict) else None
+    if not isinstance(information, dict):
+        raise LogError(f"{metadata}: not a rosbag2 description (rosbag2_bagfile_information).")
+    return information
+
+
+def _refuse_compression(folder: Path, information: dict[str, Any]) -> None:
+    storage = information.get("storage_identifier", "mcap")
+    if storage != "mcap":
+        raise LogError(
+            f"{folder}: stored as {storage!r}, expected 'mcap'. Convert it: ros2 bag convert, or "
+            "mcap convert."
+        )
+    mode = str(information.get("compression_mode") or "").upper()
+    if mode == "MESSAGE":
+        raise LogError(
+            f"{folder}: every message is compressed by itself (compression_mode MESSAGE), which "
+            "cannot be read. Convert it: ros2 bag convert with compression_mode: ''."
+        )
+    if mode == "FILE":
+        raise LogError(
+            f"{folder}: its files are compressed as a whole. Unpack them (zstd -d {folder}/*.zstd) "
+            "and give the .mcap file, or rewrite metadata.yaml: ros2 bag reindex -s mcap."
+        )
+
+
+def _inside(folder: Path, name: str) -> Path:
+    """The file of that name, which must lie in the folder."""
+    root = folder.resolve()
+    # Old rosbag2 wrote the folder's own name in front.
+    candidates = [root / name, root / Path(name).name]
+    for candidate in candidates:
+        file = candidate.resolve()
+        if not file.is_relative_to(root):
+            raise LogError(f"{folder}/metadata.yaml: {name!r} lies outside the folder; refused.")
+        if file.is_file():
+            return file
+    raise LogError(f"{folder}: metadata.yaml names {name!r}, which is missing. Copy it there.")

@@ -1,0 +1,221 @@
+"""How the base moved by its own account: poses where they are sound, the twist where they are not.
+
+Some drivers fill only one of the two, and some publish NaN for the pose while the twist is fine.
+"""
+
+from __future__ import annotations
+
+from array import array
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soundmap.geometry import FloatArray, Trajectory, composed, inverted, relative, wrapped_angle
+from soundmap.logs.messages import ros_stamp_ns
+from soundmap.losses import LossLedger
+
+MIN_QUATERNION_NORM = 1e-3
+"""A quaternion shorter than this was never set."""
+
+SHORT_GAP_S = 0.25
+"""Without a twist, poses on both sides of so short a gap are joined by a straight line."""
+
+
+class OdometryRecord:
+    """Odometry messages of one topic as they come, compactly.
+
+    Attributes
+    ----------
+    stamp_ns, log_time_ns : array of int
+    numbers : array of float
+        Eleven a message: x, y, z [m], quaternion x, y, z, w, velocity x, y, z [m/s] and turn rate
+        [rad/s] in the base frame.
+    parent, child : str
+        Frames named by the first message.
+    """
+
+    def __init__(self, parent: str = "", child: str = "") -> None:
+        self.stamp_ns = array("q")
+        self.log_time_ns = array("q")
+        self.numbers = array("d")
+        self.parent, self.child = parent, child
+
+    def add_message(self, message: Any, log_time_ns: int) -> None:
+        """Take in an odometry message."""
+        if not self.stamp_ns:
+            self.parent = message.header.frame_id.removeprefix("/")
+            self.child = message.child_frame_id.removeprefix("/")
+        p, q = message.pose.pose.position, message.pose.pose.orientation
+        v, w = message.twist.twist.linear, message.twist.twist.angular
+        self._add(
+            ros_stamp_ns(message.header.stamp),
+            log_time_ns,
+            (p.x, p.y, p.z, q.x, q.y, q.z, q.w, v.x, v.y, v.z, w.z),
+        )
+
+    def add_transform(self, stamp_ns: int, log_time_ns: int, pose: tuple[float, ...]) -> None:
+        """Take in a transform: x, y, z and quaternion; there is no twist."""
+        self._add(stamp_ns, log_time_ns, (*pose, np.nan, np.nan, np.nan, np.nan))
+
+    def _add(self, stamp_ns: int, log_time_ns: int, numbers: tuple[float, ...]) -> None:
+        self.stamp_ns.append(stamp_ns)
+        self.log_time_ns.append(log_time_ns)
+        self.numbers.extend(numbers)
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+    def table(self) -> FloatArray:
+        """The numbers, shape (K, 11)."""
+        return np.frombuffer(self.numbers, dtype=np.float64).reshape(-1, 11).copy()
+
+
+def odometry_trajectory(
+    time_ns: NDArray[np.int64], numbers: FloatArray, topic: str, losses: LossLedger
+) -> tuple[Trajectory, str]:
+    """The base in the odometry frame, and whether that is by "pose" or "twist".
+
+    Parameters
+    ----------
+    time_ns : ndarray of int64, shape (K,)
+        As recorded [ns since epoch].
+    numbers : ndarray, shape (K, 11)
+        As :class:`OdometryRecord` has them.
+    topic : str
+        For the losses.
+    losses : LossLedger
+        Where messages left out and poses replaced are counted.
+    """
+    rising = increasing(time_ns)
+    losses.add(
+        "odometry stamp runs backward or repeats",
+        topic,
+        count=int(np.count_nonzero(~rising)),
+        effect="message left out",
+    )
+    time_ns, numbers = time_ns[rising], numbers[rising]
+    pose, sound = _planar_poses(numbers)
+    twist = numbers[:, [7, 8, 10]]
+    moving = np.all(np.isfinite(twist), axis=1)
+    if _never_filled(pose, sound, twist, moving):
+        moving[:] = False
+    bad = ~sound
+    by_twist = bad & moving
+    losses.add(
+        "odometry pose is not finite",
+        topic,
+        count=int(np.count_nonzero(by_twist)),
+        effect="motion taken from the twist",
+    )
+    losses.add(
+        "odometry pose is not finite, nor is the twist usable",
+        topic,
+        count=int(np.count_nonzero(bad & ~moving)),
+        effect="message left out",
+    )
+    keep = sound | moving
+    time_ns, pose, sound, twist = time_ns[keep], pose[keep], sound[keep], twist[keep]
+    twist = np.where(moving[keep][:, None], twist, np.nan)
+    if not np.all(sound):
+        pose = _bridged(time_ns, pose, sound, twist)
+    source = "twist" if np.count_nonzero(by_twist) > np.count_nonzero(sound) else "pose"
+    return Trajectory(time_ns, pose, np.ones(len(time_ns), dtype=bool)), source
+
+
+def increasing(time_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """True where a time is later than all before it, shape (K,)."""
+    latest = np.maximum.accumulate(time_ns) if len(time_ns) else time_ns
+    rising = np.ones(len(time_ns), dtype=bool)
+    rising[1:] = time_ns[1:] > latest[:-1]
+    return rising
+
+
+def _planar_poses(numbers: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """x, y, heading, shape (K, 3), and whether they are sound, shape (K,)."""
+    x, y, z, w = numbers[:, 3:7].T
+    with np.errstate(invalid="ignore", over="ignore"):
+        norm = np.sqrt(x * x + y * y + z * z + w * w)
+        heading = np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
+        pose = np.stack([numbers[:, 0], numbers[:, 1], heading], axis=-1)
+        sound = np.all(np.isfinite(pose), axis=1) & (norm > MIN_QUATERNION_NORM)
+        sound &= np.isfinite(norm) & np.all(np.abs(pose) < 1e7, axis=1)
+    return pose, sound
+
+
+def _never_filled(
+    pose: FloatArray, sound: NDArray[np.bool_], twist: FloatArray, finite: NDArray[np.bool_]
+) -> bool:
+    """Whether the twist is nought all along although the poses move: the driver leaves it out."""
+    if np.any(twist[finite] != 0.0):
+        return False
+    reached = pose[sound]
+    return len(reached) > 1 and bool(np.any(np.ptp(reached, axis=0)[:2] > 0.01))
+
+
+def _bridged(
+    time_ns: NDArray[np.int64], pose: FloatArray, sound: NDArray[np.bool_], twist: FloatArray
+) -> FloatArray:
+    """Poses with every interval that touches an unsound one replaced by motion from the twist.
+
+    All messages have a sound pose or a finite twist. Where sound poses return, what the twist
+    missed on the way is spread over the gap, unless it is so much that the pose was reset.
+    """
+    dt = np.diff(time_ns) * 1e-9
+    driven = _driven(twist, dt)
+    result = pose.copy()
+    result[~sound] = 0.0
+    good = np.flatnonzero(sound)
+    anchor = np.zeros(3) if not len(good) else pose[good[0]]
+    first = int(good[0]) if len(good) else len(pose)
+    # Before the first sound pose: drive backward from it.
+    if first > 0:
+        path = _path(driven[:first])
+        result[: first + 1] = composed(composed(anchor, inverted(path[-1])), path)[: len(pose)]
+    shift = np.zeros(3)  # From the frame of the recorded poses to that of the result.
+    for a, b in zip(good.tolist(), [*good[1:].tolist(), len(pose)], strict=True):
+        result[a] = composed(shift, pose[a])
+        if b == a + 1:
+            continue
+        path = _path(driven[a : min(b, len(pose) - 1)])
+        reached = composed(result[a], path)
+        result[a : a + len(path)] = reached
+        if b == len(pose):
+            break
+        wanted = composed(shift, pose[b])
+        miss = relative(reached[-1], wanted)
+        length = float(np.sum(np.hypot(*np.diff(path[:, :2], axis=0).T)))
+        if np.hypot(miss[0], miss[1]) < 0.1 + 0.2 * length and abs(miss[2]) < 0.3:
+            share = ((time_ns[a : b + 1] - time_ns[a]) / (time_ns[b] - time_ns[a]))[:, None]
+            moved = reached[:, :2] + share * (wanted - reached[-1])[:2]
+            heading = wrapped_angle(reached[:, 2] + share[:, 0] * miss[2])
+            result[a : b + 1] = np.concatenate([moved, heading[:, None]], axis=1)
+        else:
+            shift = composed(reached[-1], inverted(pose[b]))
+    return result
+
+
+def _driven(twist: FloatArray, dt: FloatArray) -> FloatArray:
+    """Motion between neighbours, shape (K - 1, 3): along an arc at the mean of both twists."""
+    before, after = twist[:-1], twist[1:]
+    mean = np.where(
+        np.isnan(before), after, np.where(np.isnan(after), before, 0.5 * (before + after))
+    )
+    mean = np.nan_to_num(mean, nan=0.0)
+    turn = mean[:, 2] * dt
+    chord = np.sinc(turn / (2.0 * np.pi)) * dt  # of an arc of unit speed
+    cos, sin = np.cos(0.5 * turn) * chord, np.sin(0.5 * turn) * chord
+    x = cos * mean[:, 0] - sin * mean[:, 1]
+    y = sin * mean[:, 0] + cos * mean[:, 1]
+    return np.stack([x, y, turn], axis=-1)
+
+
+def _path(steps: FloatArray) -> FloatArray:
+    """Poses from the origin along the steps, shape (K + 1, 3)."""
+    heading = np.concatenate([[0.0], np.cumsum(steps[:, 2])])
+    cos, sin = np.cos(heading[:-1]), np.sin(heading[:-1])
+    x = np.cumsum(cos * steps[:, 0] - sin * steps[:, 1])
+    y = np.cumsum(sin * steps[:, 0] + cos * steps[:, 1])
+    return np.stack(
+        [np.concatenate([[0.0], x]), np.concatenate([[0.0], y]), wrapped_angle(heading)], axis=-1
+    )

@@ -1,0 +1,441 @@
+"""Messages of an MCAP log, in order, whatever state the file is in.
+
+The records are walked one after another, so that neither index nor summary nor footer is needed.
+Chunks are checked (size, checksum) before anything in them is believed; a damaged one is counted
+and left out. Memory holds two chunks at a time, however long the log.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from io import BytesIO
+from operator import itemgetter
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel as ChannelRecord
+from mcap.records import ChunkIndex, Footer, Schema
+
+from soundmap.errors import LogError
+from soundmap.losses import LossLedger
+
+MAGIC = b"\x89MCAP0\r\n"
+MAX_CHUNK_BYTES = 256 * 2**20
+"""A chunk that claims to expand to more than this is taken for damaged: 33 kB can claim 1 GiB."""
+
+BATCH_BYTES = 2**20
+"""Messages outside chunks are put in order in batches of this size."""
+
+_RECORD = struct.Struct("<BQ")
+_MESSAGE = struct.Struct("<HIQQ")
+_CHUNK = struct.Struct("<QQQI")
+_DAMAGE = (
+    McapError, ValueError, struct.error, OSError, KeyError, RuntimeError, MemoryError, EOFError,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Channel:
+    """Where messages of one topic come from and how they are encoded.
+
+    Attributes
+    ----------
+    topic, encoding : str
+        Encoding of the messages: "cdr", "ros1", "protobuf" ...
+    schema_name, schema_encoding : str
+        Type of the messages and the language of its definition: "ros2msg", "protobuf" ...
+    schema_data : bytes
+        The definition itself; may be empty.
+    """
+
+    topic: str
+    encoding: str
+    schema_name: str
+    schema_encoding: str
+    schema_data: bytes = field(repr=False)
+
+
+class Message(NamedTuple):
+    """One message as recorded; times in ns since epoch."""
+
+    channel: Channel
+    log_time_ns: int
+    publish_time_ns: int
+    data: memoryview
+
+
+Wanted = Callable[[Channel], bool]
+
+
+class McapLog:
+    """A log of one or several MCAP files.
+
+    The first complete pass of :meth:`messages` finds out which chunks are damaged and which topics
+    each chunk holds; later passes skip what they do not need, and count nothing twice.
+
+    Parameters
+    ----------
+    path : Path
+        As the user named it: an ``.mcap`` file or a rosbag2 folder.
+    files : tuple of Path
+        The MCAP files in order.
+    losses : LossLedger
+        Where damage is counted.
+
+    Raises
+    ------
+    LogError
+        A file cannot be opened, or is not MCAP.
+    """
+
+    def __init__(self, path: Path, files: tuple[Path, ...], losses: LossLedger) -> None:
+        self.path = path
+        self.files = files
+        self.losses = losses
+        self._chunk_topics: dict[tuple[int, int], frozenset[Channel]] = {}
+        self._surveyed = False
+        for file in files:
+            _check_magic(file)
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of all files."""
+        return sum(file.stat().st_size for file in self.files)
+
+    def fingerprint(self) -> str:
+        """SHA-256 over the sizes of the files and samples of their content; cheap for any size."""
+        digest = hashlib.sha256()
+        for file in self.files:
+            size = file.stat().st_size
+            digest.update(struct.pack("<Q", size))
+            step = max((size - 2**20) // 7, 2**20)
+            with file.open("rb") as stream:
+                for offset in range(0, size, step):
+                    stream.seek(offset)
+                    digest.update(stream.read(2**20))
+                stream.seek(max(size - 2**20, 0))
+                digest.update(stream.read(2**20))
+        return digest.hexdigest()
+
+    def messages(self, wanted: Wanted = lambda _: True) -> Iterator[Message]:
+        """Messages of the wanted channels in the order of their log time.
+
+        Order is restored inside a chunk and across neighbouring chunks. The order is the same in
+        every pass. The first pass should want everything that later passes will want.
+        """
+        for number, file in enumerate(self.files):
+            yield from _in_order(_FileWalk(self, number, file, wanted).batches())
+        self._surveyed = True
+
+    def count(self, what: str, where: str, effect: str) -> None:
+        """Count damage, unless an earlier pass has."""
+        if not self._surveyed:
+            self.losses.add(what, where, effect=effect)
+
+    def chunk_topics(self, place: tuple[int, int]) -> frozenset[Channel] | None:
+        """Channels in the chunk at (file, offset); empty if damaged, None if not seen yet."""
+        return self._chunk_topics.get(place)
+
+    def remember_chunk(self, place: tuple[int, int], channels: frozenset[Channel]) -> None:
+        """Note what a chunk holds, for later passes."""
+        self._chunk_topics[place] = channels
+
+
+class _FileWalk:
+    """One pass over the records of one file."""
+
+    def __init__(self, log: McapLog, number: int, file: Path, wanted: Wanted) -> None:
+        self.log, self.number, self.file, self.wanted = log, number, file, wanted
+        self.size = file.stat().st_size
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self.selected: dict[int, Channel | None] = {}
+        self.summary = _Summary()
+
+    def batches(self) -> Iterator[list[Message]]:
+        """Messages chunk by chunk, each list in the order of log time."""
+        with self.file.open("rb", buffering=2**18) as stream:
+            self.summary = _summary(stream, self.size)
+            stream.seek(len(MAGIC))
+            loose: list[Message] = []
+            loose_bytes = 0
+            for opcode, offset, length in self._records(stream):
+                if opcode == Opcode.CHUNK:
+                    if loose:
+                        yield sorted(loose, key=itemgetter(1))
+                        loose, loose_bytes = [], 0
+                    if batch := self._chunk(stream, offset, length):
+                        yield batch
+                elif opcode in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
+                    message = self._record(opcode, memoryview(stream.read(length)))
+                    if message is not None:
+                        loose.append(message)
+                        loose_bytes += length
+                    if loose_bytes > BATCH_BYTES:
+                        yield sorted(loose, key=itemgetter(1))
+                        loose, loose_bytes = [], 0
+            if loose:
+                yield sorted(loose, key=itemgetter(1))
+
+    def _records(self, stream: IO[bytes]) -> Iterator[tuple[int, int, int]]:
+        """Opcode, offset and length of the content of every whole record of the data section.
+
+        The stream stands at the content when a record is handed out; it may be left anywhere.
+        """
+        position = len(MAGIC)
+        while True:
+            stream.seek(position)
+            head = stream.read(_RECORD.size)
+            opcode, length = _RECORD.unpack(head) if len(head) == _RECORD.size else (0, 0)
+            if opcode in (Opcode.DATA_END, Opcode.FOOTER):
+                return
+            end = position + _RECORD.size + length
+            if opcode == 0 or end > self.size:
+                onward = self.summary.next_chunk(position)
+                if onward is None:
+                    self._ends_early(position)
+                    return
+                self.log.count(
+                    "unreadable record", self.file.name, "went on at the next chunk of the index"
+                )
+                position = onward
+                continue
+            yield opcode, position + _RECORD.size, length
+            position = end
+
+    def _ends_early(self, position: int) -> None:
+        megabytes = f"{position / 1e6:.1f} of {self.size / 1e6:.1f} MB"
+        self.log.count("log ends early", self.file.name, f"read {megabytes}, all that is whole")
+
+    def _record(self, opcode: int, data: memoryview) -> Message | None:
+        """Take in a schema or channel; hand out a message if it is wanted."""
+        if opcode == Opcode.MESSAGE:
+            if len(data) < _MESSAGE.size:
+                self.log.count("message too short", self.file.name, "left out")
+                return None
+            channel_id, _, log_time, publish_time = _MESSAGE.unpack_from(data)
+            channel = self._selected(channel_id)
+            if channel is None:
+                return None
+            return Message(channel, log_time, publish_time, data[_MESSAGE.size :])
+        try:
+            source = ReadDataStream(BytesIO(data))
+            if opcode == Opcode.SCHEMA:
+                schema = Schema.read(source)
+                self.schemas[schema.id] = schema
+            elif opcode == Opcode.CHANNEL:
+                self._add_channel(ChannelRecord.read(source))
+        except _DAMAGE:
+            self.log.count("damaged schema or channel record", self.file.name, "left out")
+        return None
+
+    def _add_channel(self, record: ChannelRecord) -> None:
+        schema = self.schemas.get(record.schema_id) or self.summary.schemas.get(record.schema_id)
+        channel = Channel(
+            record.topic,
+            record.message_encoding,
+            schema.name if schema else "",
+            schema.encoding if schema else "",
+            schema.data if schema else b"",
+        )
+        if self.channels.get(record.id) != channel:
+            self.channels[record.id] = channel
+            self.selected.pop(record.id, None)
+
+    def _selected(self, channel_id: int) -> Channel | None:
+        """The channel, if its messages are wanted."""
+        if channel_id not in self.selected:
+            self._known(channel_id)
+            channel = self.channels.get(channel_id)
+            if channel is None:
+                self.log.count("message without a channel", self.file.name, "left out")
+                return None
+            self.selected[channel_id] = channel if self.wanted(channel) else None
+        return self.selected[channel_id]
+
+    def _known(self, channel_id: int) -> None:
+        """Fall back on the summary for a channel whose own record was in a damaged chunk."""
+        if channel_id not in self.channels and channel_id in self.summary.channels:
+            self._add_channel(self.summary.channels[channel_id])
+
+    def _chunk(self, stream: IO[bytes], offset: int, length: int) -> list[Message]:
+        """The wanted messages of a chunk in the order of log time."""
+        place = (self.number, offset)
+        held = self.log.chunk_topics(place)
+        if held is not None and not any(self.wanted(channel) for channel in held):
+            return []
+        try:
+            # Checksums need no second look in later passes: a damaged chunk holds no topics.
+            data = _chunk_content(stream.read(length), check=held is None)
+        except _DAMAGE as error:
+            self.log.count("damaged chunk", self.file.name, f"left out ({_reason(error)})")
+            self.log.remember_chunk(place, frozenset())
+            return []
+        messages, seen = self._chunk_messages(memoryview(data))
+        self.log.remember_chunk(place, frozenset(seen))
+        messages.sort(key=itemgetter(1))
+        return messages
+
+    def _chunk_messages(self, data: memoryview) -> tuple[list[Message], set[Channel]]:
+        messages: list[Message] = []
+        ids: set[int] = set()
+        position, end = 0, len(data)
+        read_head, read_message, head_size = _RECORD.unpack_from, _MESSAGE.unpack_from, _RECORD.size
+        while position + head_size <= end:
+            opcode, length = read_head(data, position)
+            start = position + head_size
+            position = start + length
+            if position > end:
+                self.log.count("record reaches beyond its chunk", self.file.name, "left out")
+                break
+            if opcode != 5 or length < 22:
+                self._record(opcode, data[start:position])
+                continue
+            channel_id, _, log_time, publish_time = read_message(data, start)
+            ids.add(channel_id)
+            channel = self._selected(channel_id)
+            if channel is not None:
+                messages.append(
+                    Message(channel, log_time, publish_time, data[start + 22 : position])
+                )
+        return messages, {self.channels[i] for i in ids if i in self.channels}
+
+
+@dataclass
+class _Summary:
+    """What the end of an intact file says: a fallback where the data section is damaged."""
+
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, ChannelRecord] = field(default_factory=dict)
+    chunk_offsets: list[int] = field(default_factory=list)
+
+    def next_chunk(self, position: int) -> int | None:
+        """Offset of the first chunk after a position, None if there is none."""
+        return min((offset for offset in self.chunk_offsets if offset > position), default=None)
+
+
+def _summary(stream: IO[bytes], size: int) -> _Summary:
+    found = _Summary()
+    tail_bytes = _RECORD.size + 20 + len(MAGIC)
+    if size < tail_bytes + len(MAGIC):
+        return found
+    stream.seek(size - tail_bytes)
+    tail = stream.read(tail_bytes)
+    opcode, length = _RECORD.unpack_from(tail)
+    if opcode != Opcode.FOOTER or length != 20 or not tail.endswith(MAGIC):
+        return found
+    start = Footer.read(ReadDataStream(BytesIO(tail[_RECORD.size :]))).summary_start
+    if not len(MAGIC) <= start < size - tail_bytes or size - start > MAX_CHUNK_BYTES:
+        return found
+    stream.seek(start)
+    data = memoryview(stream.read(size - tail_bytes - start))
+    position = 0
+    try:
+        while position + _RECORD.size <= len(data):
+            opcode, length = _RECORD.unpack_from(data, position)
+            position += _RECORD.size
+            source = ReadDataStream(BytesIO(data[position : position + length]))
+            position += length
+            if opcode == Opcode.SCHEMA:
+                schema = Schema.read(source)
+                found.schemas[schema.id] = schema
+            elif opcode == Opcode.CHANNEL:
+                channel = ChannelRecord.read(source)
+                found.channels[channel.id] = channel
+            elif opcode == Opcode.CHUNK_INDEX:
+                found.chunk_offsets.append(ChunkIndex.read(source).chunk_start_offset)
+    except _DAMAGE:
+        return _Summary()
+    found.chunk_offsets.sort()
+    return found
+
+
+def _chunk_content(record: bytes, *, check: bool) -> bytes | memoryview:
+    """Records of a chunk, decompressed, of the promised size and checksum."""
+    _, _, size, checksum = _CHUNK.unpack_from(record)
+    position = _CHUNK.size
+    (name_length,) = struct.unpack_from("<I", record, position)
+    position += 4
+    compression = record[position : position + name_length].decode()
+    position += name_length
+    (length,) = struct.unpack_from("<Q", record, position)
+    compressed = memoryview(record)[position + 8 : position + 8 + length]
+    if len(compressed) != length:
+        raise ValueError("it is cut short")
+    if size > MAX_CHUNK_BYTES:
+        raise ValueError(f"it claims {size / 2**20:.0f} MiB, more than is credible")
+    data = _decompressed(compressed, compression, size)
+    if len(data) != size:
+        raise ValueError(f"{size} bytes promised, {len(data)} found")
+    if check and checksum and zlib.crc32(data) != checksum:
+        raise ValueError("wrong checksum")
+    return data
+
+
+def _decompressed(data: memoryview, compression: str, size: int) -> bytes | memoryview:
+    if compression == "" or size == 0:
+        return data
+    if compression == "zstd":
+        import zstandard
+
+        try:
+            promised = zstandard.frame_content_size(data)
+            if promised not in (-1, size):
+                raise ValueError(f"{size} bytes promised, {promised} packed")
+            return zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
+        except zstandard.ZstdError as error:
+            raise ValueError(str(error)) from None
+    if compression == "lz4":
+        import lz4.frame
+
+        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size))
+    raise ValueError(f"compressed with {compression!r}, which is unknown here")
+
+
+def _reason(error: BaseException) -> str:
+    return str(error) or type(error).__name__
+
+
+def _in_order(batches: Iterator[list[Message]]) -> Iterator[Message]:
+    """Merge batches, each in order, over neighbours: one batch is held back."""
+    held: list[Message] = []
+    for batch in batches:
+        if held and held[-1].log_time_ns > batch[0].log_time_ns:
+            # Overlapping neighbours. What was held before goes out up to where the new one begins,
+            # and of the rest no more is held than the new batch is long in time.
+            merged = sorted([*held, *batch], key=itemgetter(1))
+            ready = len(merged) - len(batch)
+            yield from merged[:ready]
+            held = merged[ready:]
+        else:
+            yield from held
+            held = batch
+    yield from held
+
+
+def _check_magic(file: Path) -> None:
+    """Refuse what is not MCAP, with a word on what it is."""
+    try:
+        with file.open("rb") as stream:
+            start = stream.read(16)
+    except OSError as error:
+        raise LogError(f"{file}: cannot be opened ({error.strerror}). Check the path.") from None
+    if start.startswith(MAGIC):
+        return
+    if not start:
+        raise LogError(f"{file}: the file is empty. Was the recording stopped before it began?")
+    known: dict[bytes, Any] = {
+        b"\x28\xb5\x2f\xfd": "compressed as a whole; unpack it first: zstd -d FILE",
+        b"\x04\x22\x4d\x18": "compressed as a whole; unpack it first: lz4 -d FILE",
+        b"#ROSBAG V2.0": "a ROS 1 bag; convert it first: mcap convert FILE OUT.mcap",
+        b"SQLite format 3": "a rosbag2 database; convert it first: mcap convert FILE OUT.mcap",
+    }
+    what = next((text for magic, text in known.items() if start.startswith(magic)), None)
+    raise LogError(f"{file}: not an MCAP file, but {what or 'something else'}.")

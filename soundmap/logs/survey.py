@@ -1,0 +1,298 @@
+"""One pass over a log: which topics there are, and everything about them that is small.
+
+Samples and ranges stay in the file. What is kept of a message is its stamp, its size, its place in
+the stream; of odometry and transforms, which are small, everything.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from soundmap.logs.audio_messages import (
+    PACKET_READERS,
+    AudioEncoding,
+    AudioFormatError,
+    info_encoding,
+)
+from soundmap.logs.laser_messages import SWEEP_READERS, LaserSweep, valid_ranges
+from soundmap.logs.messages import KINDS, Form, Kind, form_of
+from soundmap.logs.odometry import OdometryRecord
+from soundmap.logs.reader import Channel, McapLog, Message
+from soundmap.logs.schemas import Decoder, MessageError, MessageType, SchemaError, message_type
+from soundmap.logs.transforms import TRANSFORM_READERS, TransformRecord
+from soundmap.losses import LossLedger
+
+DAMAGED = -(2**62)
+"""Stands for the stamp of a message that cannot be used."""
+
+_ATTRIBUTE_FAULTS = (MessageError, AttributeError, TypeError, ValueError, OverflowError, IndexError)
+
+
+@dataclass
+class AudioRecord:
+    """What is kept of an audio topic: one entry a message, damaged ones included."""
+
+    form: Form
+    stamp_ns: array[int] = field(default_factory=lambda: array("q"))
+    log_time_ns: array[int] = field(default_factory=lambda: array("q"))
+    size: array[int] = field(default_factory=lambda: array("q"))
+    declared_frames: array[int] = field(default_factory=lambda: array("q"))
+    first_frame: array[int] = field(default_factory=lambda: array("q"))
+    encoding: array[int] = field(default_factory=lambda: array("i"))
+    encodings: list[AudioEncoding | None] = field(default_factory=list)
+    frame_ids: Counter[str] = field(default_factory=Counter)
+
+    def add(self, decoded: Any, log_time_ns: int) -> None:
+        """Take in a message; MessageError if it makes no sense."""
+        packet = PACKET_READERS[self.form](decoded)
+        if packet.encoding not in self.encodings:
+            self.encodings.append(packet.encoding)
+        self.frame_ids[packet.frame_id] += 1
+        self._append(
+            packet.stamp_ns,
+            log_time_ns,
+            len(packet.data),
+            -1 if packet.declared_frames is None else packet.declared_frames,
+            -1 if packet.first_frame is None else packet.first_frame,
+            self.encodings.index(packet.encoding),
+        )
+
+    def add_damaged(self, log_time_ns: int) -> None:
+        """Take note of a message that cannot be used."""
+        self._append(DAMAGED, log_time_ns, 0, -1, -1, -1)
+
+    def _append(
+        self, stamp: int, log_time: int, size: int, declared: int, first: int, encoding: int
+    ) -> None:
+        self.stamp_ns.append(stamp)
+        self.log_time_ns.append(log_time)
+        self.size.append(size)
+        self.declared_frames.append(declared)
+        self.first_frame.append(first)
+        self.encoding.append(encoding)
+
+
+@dataclass
+class LaserRecord:
+    """What is kept of a laser topic: one entry a message, damaged ones included."""
+
+    form: Form
+    topic: str
+    losses: LossLedger
+    stamp_ns: array[int] = field(default_factory=lambda: array("q"))
+    log_time_ns: array[int] = field(default_factory=lambda: array("q"))
+    frame_ids: Counter[str] = field(default_factory=Counter)
+    first: LaserSweep | None = None
+    beams: int = 0
+    longest_m: float = 0.0
+    any_return: bool = False
+
+    def add(self, decoded: Any, log_time_ns: int) -> None:
+        """Take in a message; MessageError if it makes no sense."""
+        sweep = SWEEP_READERS[self.form](decoded)
+        if not len(sweep.ranges):
+            self.losses.add("laser scan without ranges", self.topic, effect="left out")
+            self.add_damaged(log_time_ns)
+            return
+        if self.first is None:
+            self.first, self.beams = sweep._replace(ranges=()), len(sweep.ranges)
+        unlimited = not np.isfinite(sweep.range_max_m) or sweep.range_max_m <= 0.0
+        if unlimited or not self.any_return:
+            ranges = valid_ranges(sweep)
+            if np.any(np.isfinite(ranges)):
+                self.any_return = True
+                self.longest_m = max(self.longest_m, float(np.nanmax(ranges)))
+        self.frame_ids[sweep.frame_id] += 1
+        self.stamp_ns.append(sweep.stamp_ns)
+        self.log_time_ns.append(log_time_ns)
+
+    def add_damaged(self, log_time_ns: int) -> None:
+        """Take note of a message that cannot be used."""
+        self.stamp_ns.append(DAMAGED)
+        self.log_time_ns.append(log_time_ns)
+
+
+@dataclass
+class Topic:
+    """One topic of the log.
+
+    ``problem`` says why messages cannot be read, if so; ``record`` depends on the kind.
+    """
+
+    name: str
+    schema: str
+    encoding: str
+    form: Form = Form.OTHER
+    messages: int = 0
+    problem: str = ""
+    built_in: bool = False
+    first_ns: int = 0
+    last_ns: int = 0
+    record: AudioRecord | LaserRecord | OdometryRecord | None = None
+    info: AudioEncoding | None = None
+
+    @property
+    def kind(self) -> Kind:
+        """What the topic carries."""
+        return KINDS[self.form]
+
+
+class Decoders:
+    """Type and decoder of every channel, made once for each definition."""
+
+    def __init__(self) -> None:
+        self._types: dict[tuple[str, ...] | bytes, MessageType | SchemaError] = {}
+        self._decoders: dict[Any, Decoder] = {}
+
+    def type_of(self, channel: Channel) -> MessageType:
+        """Fields of the channel's messages; SchemaError if they cannot be read."""
+        key: Any = self._key(channel)
+        if key not in self._types:
+            try:
+                self._types[key] = message_type(channel)
+            except SchemaError as error:
+                self._types[key] = error
+        found = self._types[key]
+        if isinstance(found, SchemaError):
+            raise found
+        return found
+
+    def decoder(self, channel: Channel) -> Decoder:
+        """What decodes the channel's messages; SchemaError if they cannot be read."""
+        key = self._key(channel)
+        if key not in self._decoders:
+            kind = self.type_of(channel)
+            try:
+                self._decoders[key] = kind.decoder()
+            except Exception as error:
+                # Code is generated from a definition that may be anything.
+                raise SchemaError(f"no decoder for {channel.schema_name} ({error})") from None
+        return self._decoders[key]
+
+    @staticmethod
+    def _key(channel: Channel) -> Any:
+        return (
+            channel.encoding,
+            channel.schema_name,
+            channel.schema_encoding,
+            channel.schema_data,
+        )
+
+
+class Survey:
+    """What one pass over a log has found.
+
+    Attributes
+    ----------
+    topics : dict
+        By name.
+    transforms : TransformRecord
+    start_ns, end_ns : int
+        Log time of the first and last message.
+    messages : int
+    """
+
+    def __init__(self, log: McapLog, *, need_audio: bool = True) -> None:
+        self.topics: dict[str, Topic] = {}
+        self.transforms = TransformRecord()
+        self.decoders = Decoders()
+        self.losses = log.losses
+        self.start_ns = self.end_ns = self.messages = 0
+        self._need_audio = need_audio
+        self._takers: dict[Channel, Callable[[Message], None]] = {}
+        for message in log.messages():
+            taker = self._takers.get(message.channel)
+            if taker is None:
+                taker = self._takers[message.channel] = self._taker(message.channel)
+            taker(message)
+            self.messages += 1
+        times = [(t.first_ns, t.last_ns) for t in self.topics.values() if t.messages]
+        if times:
+            self.start_ns, self.end_ns = min(t[0] for t in times), max(t[1] for t in times)
+
+    def of_kind(self, kind: Kind) -> list[Topic]:
+        """Topics of a kind, in alphabetical order."""
+        return sorted((t for t in self.topics.values() if t.kind is kind), key=lambda t: t.name)
+
+    def _taker(self, channel: Channel) -> Callable[[Message], None]:
+        """What to do with the messages of a channel."""
+        topic = self.topics.setdefault(
+            channel.topic, Topic(channel.topic, channel.schema_name, channel.encoding)
+        )
+        take: Callable[[Any, int], None] | None = None
+        decode: Decoder | None = None
+        try:
+            kind = self.decoders.type_of(channel)
+            form = form_of(kind)
+            if topic.form is Form.OTHER:
+                topic.form, topic.built_in = form, kind.built_in
+            if form is topic.form:
+                take = self._take(topic)
+                decode = self.decoders.decoder(channel) if take else None
+        except SchemaError as error:
+            topic.problem = str(error).splitlines()[0]
+
+        def taker(message: Message) -> None:
+            time = message.log_time_ns
+            if not topic.messages:
+                topic.first_ns = topic.last_ns = time
+            topic.messages += 1
+            topic.first_ns, topic.last_ns = min(topic.first_ns, time), max(topic.last_ns, time)
+            if take is None or decode is None:
+                self._skip(topic, time)
+                return
+            try:
+                take(decode(message.data), time)
+            except _ATTRIBUTE_FAULTS:
+                self.losses.add(f"damaged {topic.kind} message", topic.name, effect="left out")
+                self._skip(topic, time)
+
+        return taker
+
+    @staticmethod
+    def _skip(topic: Topic, time: int) -> None:
+        if isinstance(topic.record, AudioRecord | LaserRecord):
+            topic.record.add_damaged(time)
+
+    def _take(self, topic: Topic) -> Callable[[Any, int], None] | None:
+        if topic.kind is Kind.AUDIO:
+            if not self._need_audio:
+                return None
+            if not isinstance(topic.record, AudioRecord):
+                topic.record = AudioRecord(topic.form)
+            return topic.record.add
+        if topic.kind is Kind.LASER:
+            if not isinstance(topic.record, LaserRecord):
+                topic.record = LaserRecord(topic.form, topic.name, self.losses)
+            return topic.record.add
+        if topic.kind is Kind.ODOMETRY:
+            if not isinstance(topic.record, OdometryRecord):
+                topic.record = OdometryRecord()
+            return topic.record.add_message
+        if topic.kind is Kind.TRANSFORMS:
+            return self._transform_taker(topic)
+        if topic.kind is Kind.AUDIO_INFO:
+            return lambda decoded, _: self._take_info(topic, decoded)
+        return None
+
+    def _transform_taker(self, topic: Topic) -> Callable[[Any, int], None]:
+        reader = TRANSFORM_READERS[topic.form]
+        static = topic.name.rstrip("/").endswith("static")
+
+        def take(decoded: Any, time: int) -> None:
+            self.transforms.add(topic.name, reader(decoded), time, static=static)
+
+        return take
+
+    @staticmethod
+    def _take_info(topic: Topic, decoded: Any) -> None:
+        try:
+            topic.info = topic.info or info_encoding(decoded)
+        except AudioFormatError as error:
+            topic.problem = str(error)
