@@ -35,7 +35,7 @@ BESIDE = (1.02, 0.0, 0.03, 1.0)
 """Place of a colour bar as tall as the axes, in their own coordinates."""
 
 
-def write_trajectory(file: Path, run: Run) -> None:
+def trajectory_figure(run: Run) -> Figure:
     """Fig. 2: geometric map, way of the robot, sources."""
     trajectory = run.trajectory
     places = [(source.x_m, source.y_m) for source in run.sources]
@@ -43,10 +43,11 @@ def write_trajectory(file: Path, run: Run) -> None:
     figure, axes = floor_plan(area, run.room, f"{run.log.stem}: geometric map and trajectory")
     _draw_trajectory(axes, trajectory)
     draw_places(axes, places, area)
-    _save(figure, file, legend_of=axes)
+    _add_legend(figure, axes)
+    return figure
 
 
-def write_power_map(file: Path, run: Run) -> None:
+def power_map_figure(run: Run) -> Figure:
     """Fig. 6: power map in dB over the geometric map, with its local maxima."""
     power_map, share = run.power_map, run.config.detect.min_visit_share
     level = decibels(power_map.power(min_visit_share=share))
@@ -80,12 +81,11 @@ def write_power_map(file: Path, run: Run) -> None:
     draw_wall_outlines(axes, run.room, area)
     axes.plot(*run.trajectory.pose[:, :2].T, color="0.45", linewidth=0.8, label="trajectory")
     draw_places(axes, places, area)
-    _save(figure, file, legend_of=axes)
+    _add_legend(figure, axes)
+    return figure
 
 
-def write_power_ratio(
-    file: Path, ratio: PowerRatio, *, room: OccupancyGrid | None, title: str
-) -> None:
+def power_ratio_figure(ratio: PowerRatio, *, room: OccupancyGrid | None, title: str) -> Figure:
     """Fig. 7: difference of two power maps in dB; red is louder than the background."""
     level = ratio.ratio_db
     places = [(change.x_m, change.y_m) for change in ratio.changes]
@@ -118,10 +118,11 @@ def write_power_ratio(
     if room is not None:
         draw_wall_outlines(axes, room, area)
     draw_places(axes, places, area)
-    _save(figure, file, legend_of=axes)
+    _add_legend(figure, axes)
+    return figure
 
 
-def write_audio_scans(file: Path, run: Run) -> None:
+def audio_scan_figure(run: Run) -> Figure:
     """Level on every bearing over time, as the array heard it (Sect. 2.3)."""
     scans = run.scans
     figure = Figure(figsize=(10.0, 4.2), layout="constrained")
@@ -152,7 +153,14 @@ def write_audio_scans(file: Path, run: Run) -> None:
             interpolation="nearest",
         )
         figure.colorbar(image, ax=axes, label=f"power [{_written(scans)}]")
-    _save(figure, file)
+    return figure
+
+
+def write_png(figure: Figure, file: Path) -> None:
+    """Write a picture; equal pictures give equal bytes."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a log's name may hold letters that the font lacks
+        figure.savefig(file, format="png", dpi=DOTS_PER_INCH, bbox_inches="tight")
 
 
 def _draw_trajectory(axes: Axes, trajectory: Trajectory) -> None:
@@ -251,14 +259,7 @@ def _say_nothing_measured(axes: Axes) -> None:
     axes.text(0.5, 0.5, "nothing measured", transform=axes.transAxes, ha="center", va="center")
 
 
-def _save(figure: Figure, file: Path, *, legend_of: Axes | None = None) -> None:
-    if legend_of is not None and legend_of.get_legend_handles_labels()[0]:
-        figure.legend(
-            *legend_of.get_legend_handles_labels(),
-            loc="outside lower center",
-            ncols=5,
-            frameon=False,
-        )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a log's name may hold letters that the font lacks
-        figure.savefig(file, format="png", dpi=DOTS_PER_INCH, bbox_inches="tight")
+def _add_legend(figure: Figure, axes: Axes) -> None:
+    handles, labels = axes.get_legend_handles_labels()
+    if handles:
+        figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False)

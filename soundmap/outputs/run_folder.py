@@ -51,9 +51,9 @@ def write_run(run: Run, folder: Path) -> dict[str, Any]:
         write_arrays(folder / "audio_scans.npz", _audio_scan_arrays(run.scans))
         _write_map(folder, run.room)
         (folder / "config.toml").write_text(config_toml(run.config), encoding="utf-8")
-        figures.write_trajectory(folder / "trajectory.png", run)
-        figures.write_power_map(folder / "power_map.png", run)
-        figures.write_audio_scans(folder / "audio_scans.png", run)
+        figures.write_png(figures.trajectory_figure(run), folder / "trajectory.png")
+        figures.write_png(figures.power_map_figure(run), folder / "power_map.png")
+        figures.write_png(figures.audio_scan_figure(run), folder / "audio_scans.png")
         report = run_report(run, {**run.timings_s, "outputs": time.perf_counter() - start})
         _write_tables(folder, SOURCE_COLUMNS, report)
     return report
@@ -96,7 +96,8 @@ def write_diff(
         if room is not None:
             _write_map(folder, room)
         title = f"{run.resolve().name} against {background.resolve().name}"
-        figures.write_power_ratio(folder / "power_ratio.png", ratio, room=room, title=title)
+        figure = figures.power_ratio_figure(ratio, room=room, title=title)
+        figures.write_png(figure, folder / "power_ratio.png")
         report = diff_report(
             ratio,
             run=run,
