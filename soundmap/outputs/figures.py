@@ -90,8 +90,7 @@ def power_ratio_figure(ratio: PowerRatio, *, room: OccupancyGrid | None, title: 
     level = ratio.ratio_db
     places = [(change.x_m, change.y_m) for change in ratio.changes]
     area = area_of_interest([_measured_points(level, ratio.frame), _points(places)], room)
-    figure, axes = floor_plan(area, room, f"{title}: difference of power maps")
-    axes.set_facecolor("0.85")  # white is "no difference" here
+    figure, axes = floor_plan(area, room, f"{title}: difference of power maps", dimmed=True)
     finite = np.abs(level[np.isfinite(level)])
     reach = float(np.clip(finite.max(initial=0.0), LEAST_RATIO_DB, GREATEST_RATIO_DB))
     part, extent = cropped(level, ratio.frame, area)
@@ -112,9 +111,7 @@ def power_ratio_figure(ratio: PowerRatio, *, room: OccupancyGrid | None, title: 
         bar = figure.colorbar(image, cax=axes.inset_axes(BESIDE), extend=_open_ends(level, reach))
         bar.set_label("power of the run over that of the background [dB]")
         if np.any(np.isfinite(level) & ~ratio.background_measured):
-            axes.set_xlabel(
-                "x [m]\npale: against the background's median, itself not measured there"
-            )
+            axes.set_xlabel("x [m]\npale: not measured in the background, whose median stands in")
     if room is not None:
         draw_wall_outlines(axes, room, area)
     draw_places(axes, places, area)

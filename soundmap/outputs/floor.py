@@ -16,6 +16,7 @@ from soundmap.geometry import FloatArray
 from soundmap.grid import GridFrame, OccupancyGrid
 
 WALL, UNKNOWN, OPEN = 0.25, 0.90, 1.0
+DIMMED_UNKNOWN, DIMMED_OPEN = 0.80, 0.90
 """Grey values of the geometric map, 0 black to 1 white."""
 
 MARGIN_M = 0.75
@@ -76,8 +77,20 @@ def area_of_interest(points_m: Iterable[FloatArray], room: OccupancyGrid | None)
     return Area(float(left), float(left + side[0]), float(bottom), float(bottom + side[1]))
 
 
-def floor_plan(area: Area, room: OccupancyGrid | None, title: str) -> tuple[Figure, Axes]:
-    """A figure of a size that suits the area, with the geometric map and metres on its axes."""
+def floor_plan(
+    area: Area, room: OccupancyGrid | None, title: str, *, dimmed: bool = False
+) -> tuple[Figure, Axes]:
+    """A figure of a size that suits the area, with the geometric map and metres on its axes.
+
+    Parameters
+    ----------
+    area : Area
+    room : OccupancyGrid or None
+    title : str
+    dimmed : bool
+        Keep white for the data: open space is grey, too.
+    """
+    unknown, free = (DIMMED_UNKNOWN, DIMMED_OPEN) if dimmed else (UNKNOWN, OPEN)
     scale = LONG_SIDE_INCHES / max(area.width, area.height)
     figure = Figure(
         figsize=(max(area.width * scale, 4.0) + 1.8, area.height * scale + 1.3),
@@ -85,10 +98,10 @@ def floor_plan(area: Area, room: OccupancyGrid | None, title: str) -> tuple[Figu
     )
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
+    axes.set_facecolor(str(unknown))
     if room is not None:
-        shade = np.full(room.frame.shape, UNKNOWN, dtype=np.float32)
-        shade[room.free], shade[room.occupied] = OPEN, WALL
-        axes.set_facecolor(str(UNKNOWN))
+        shade = np.full(room.frame.shape, unknown, dtype=np.float32)
+        shade[room.free], shade[room.occupied] = free, WALL
         part, extent = cropped(shade, room.frame, area)
         axes.imshow(part, origin="lower", extent=extent, cmap="gray", vmin=0, vmax=1)
     axes.set_aspect("equal")

@@ -100,6 +100,7 @@ def test_times_before_1970_and_around_it_are_written_right():
 def test_the_map_and_the_configuration_read_back_as_they_were(folder):
     room = read_map(folder / "map.yaml")
     np.testing.assert_array_equal(room.occupied, made_run().room.occupied)
+    np.testing.assert_array_equal(room.free, made_run().room.free)
     assert loaded_config([folder / "config.toml"]) == Config()
 
 

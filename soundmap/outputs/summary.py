@@ -1,0 +1,172 @@
+"""What a person reads at the end of a command, on a terminal of 80 columns or in a pipe."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich import box
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+SHOWN_ROWS = 10
+
+
+def run_view(report: Mapping[str, Any]) -> RenderableType:
+    """Sources, trajectory, losses, time and files of one run.
+
+    Parameters
+    ----------
+    report : mapping
+        As in ``report.json``, and ``folder``, where all is.
+    """
+    spent_s = sum(report["timings_s"].values())
+    speed = f", {report['speed']:.3g} x real time" if report["speed"] else ""
+    way = report["trajectory"]
+    usable = "none" if way["usable_share"] is None else f"{100 * way['usable_share']:.1f} %"
+    return Group(
+        Text(f"{report['log']}: {report['duration_s']:.1f} s of log in {spent_s:.1f} s{speed}"),
+        _source_table(report),
+        _lines(
+            {
+                "Trajectory": f"{way['length_m']:.2f} m, {way['poses']} poses, {usable} usable",
+                "Used": ", ".join(f"{count} {_words(name)}" for name, count in _counts(report)),
+                "Time": _times(report["timings_s"]),
+                "Files": f"{report['folder']}/",
+            }
+        ),
+        *_losses(report["losses"]),
+    )
+
+
+def diff_view(report: Mapping[str, Any]) -> RenderableType:
+    """Changes and files of a difference of two runs."""
+    changes = _table("id", align_right=("x [m]", "y [m]", "louder by [dB]", "visits"))
+    nothing = Text("\n  no place is louder than before\n")
+    found = _filled(changes, report["sources"], "ratio_db") if report["sources"] else nothing
+    counts = report["counts"]
+    return Group(
+        Text(f"{report['run']} against {report['background']}"),
+        found,
+        _lines(
+            {
+                "Cells": f"{counts['cells_compared']} compared, "
+                f"{counts['cells_without_background']} of them with the background's median",
+                "Time": _times(report["timings_s"]),
+                "Files": f"{report['folder']}/",
+            }
+        ),
+    )
+
+
+def log_view(summary: Mapping[str, Any]) -> RenderableType:
+    """What a log holds and what of it would be used, from the summary's plain form."""
+    topics = _table("topic", align_right=("messages", "rate [Hz]"), left=("schema", "used as"))
+    for topic in summary["topics"]:
+        topics.add_row(
+            Text(topic["name"], overflow="fold"),
+            str(topic["messages"]),
+            _number(topic["rate_hz"], 1),
+            Text(topic["schema"], overflow="fold"),
+            topic["kind"] if topic["used"] else "-",
+        )
+    found = {
+        "Audio": _described(summary["audio"]),
+        **{f"Laser {n}": _described(laser) for n, laser in enumerate(summary["lasers"], start=1)},
+        "Odometry": _described(summary["odometry"]),
+        **{f"Mount of {frame}": _described(mount) for frame, mount in summary["mounts"].items()},
+    }
+    problems = [Text(f"- {problem}") for problem in summary["problems"]]
+    return Group(
+        Text(
+            f"{summary['path']}: {summary['duration_s']:.1f} s, "
+            f"{summary['size_bytes'] / 1e6:.1f} MB"
+        ),
+        topics,
+        _lines(found),
+        *_losses(summary["losses"]),
+        *([Text(""), Text("Problems", style="bold"), *problems] if problems else []),
+    )
+
+
+def _source_table(report: Mapping[str, Any]) -> RenderableType:
+    if not report["sources"]:
+        return Text("\n  no sources found\n")
+    level = f"level [{report['level_reference']}]"
+    table = _table("id", align_right=("x [m]", "y [m]", level, "visits"))
+    return _filled(table, report["sources"], "power_db")
+
+
+def _filled(table: Table, rows: Sequence[Mapping[str, Any]], level: str) -> RenderableType:
+    """The table with the loudest places."""
+    for row in rows[:SHOWN_ROWS]:
+        place = (f"{row['x_m']:.3f}", f"{row['y_m']:.3f}")
+        table.add_row(row["id"], *place, _number(row[level], 1), str(row["visits"]))
+    if (more := len(rows) - SHOWN_ROWS) > 0:
+        return Group(table, Text(f"  and {more} more in sources.csv\n"))
+    return table
+
+
+def _losses(losses: Sequence[Mapping[str, Any]]) -> list[RenderableType]:
+    if not losses:
+        return [Text("Nothing was lost.")]
+    table = Table(box=box.SIMPLE, title_justify="left", pad_edge=False)
+    for title in ("", "times", "what", "where", "what was done"):
+        table.add_column(Text(title), justify="right" if title == "times" else "left")
+    for loss in losses:
+        kind = "lost" if loss["data_lost"] else "note"
+        cells = (kind, str(loss["count"]), loss["what"], loss["where"], loss["effect"])
+        table.add_row(*(Text(cell, overflow="fold") for cell in cells))
+    return [Text(""), Text("Losses and notes", style="bold"), table]
+
+
+def _table(first: str, *, align_right: Sequence[str], left: Sequence[str] = ()) -> Table:
+    table = Table(box=box.SIMPLE, pad_edge=False)
+    table.add_column(Text(first))
+    for title in align_right:
+        table.add_column(Text(title), justify="right")
+    for title in left:
+        table.add_column(Text(title))
+    return table
+
+
+def _lines(lines: Mapping[str, str]) -> Table:
+    grid = Table.grid(padding=(0, 2))
+    for title, content in lines.items():
+        if content:
+            grid.add_row(Text(title, style="bold"), Text(content, overflow="fold"))
+    return grid
+
+
+def _described(thing: Mapping[str, Any] | None) -> str:
+    """Names and values of something's fields on one line."""
+    if thing is None:
+        return "none"
+    return ", ".join(f"{_words(name)} {_value(value)}" for name, value in thing.items())
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, Mapping):
+        return f"({_described(value)})"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(_value(item) for item in value)}]"
+    return "-" if value is None else str(value)
+
+
+def _times(timings_s: Mapping[str, float]) -> str:
+    return ", ".join(f"{_words(stage)} {seconds:.2f} s" for stage, seconds in timings_s.items())
+
+
+def _counts(report: Mapping[str, Any]) -> list[tuple[str, int]]:
+    return list(report["counts"].items())
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _number(value: float | None, decimals: int) -> str:
+    return "-" if value is None else f"{value:.{decimals}f}"

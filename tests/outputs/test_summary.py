@@ -1,0 +1,120 @@
+import io
+from dataclasses import replace
+
+import pytest
+from handmade import made_ratio, made_run, unlucky_run
+from rich.console import Console
+
+from soundmap.config import DiffConfig
+from soundmap.losses import Loss
+from soundmap.outputs.report import diff_report, run_report
+from soundmap.outputs.summary import diff_view, log_view, run_view
+from soundmap.sound import LevelReference, Source, SourceList
+
+
+def printed(view, *, width: int = 80) -> str:
+    stream = io.StringIO()
+    Console(file=stream, width=width, highlight=False).print(view)
+    return stream.getvalue()
+
+
+def run_text(run) -> str:
+    return printed(run_view({**run_report(run, run.timings_s), "folder": "out/run1"}))
+
+
+def test_the_summary_of_a_run_names_everything_a_person_asks_for():
+    text = run_text(made_run())
+    assert "20.0 s of log in 2.0 s, 10 x real time" in text
+    assert "dB re (full scale)^2" in text
+    rows = [line.split() for line in text.splitlines() if line.strip().startswith("S")]
+    assert ["S1", "3.125", "0.275", "-64.0", "22"] in rows
+    assert "400 poses, 90.0 % usable" in text
+    assert "localize 1.25 s" in text
+    assert "out/run1/" in text
+    assert all(word in " ".join(text.split()) for word in ("1294", "/odom", "lost", "note"))
+
+
+def test_the_summary_fits_eighty_columns():
+    assert max(len(line) for line in run_text(made_run()).splitlines()) <= 80
+
+
+def test_a_run_without_sources_and_losses_says_so():
+    text = run_text(unlucky_run())
+    assert "no sources found" in text
+    assert "Nothing was lost." in text
+
+
+def test_many_sources_are_counted_and_not_all_listed():
+    many = tuple(Source(1.0, 2.0, 1e-6, 3) for _ in range(25))
+    text = run_text(replace(made_run(), sources=SourceList(many, LevelReference.FULL_SCALE)))
+    assert "S10" in text
+    assert "S11" not in text
+    assert "and 15 more in sources.csv" in text
+
+
+def test_brackets_in_what_a_log_says_are_not_taken_for_markup():
+    loss = Loss("odd [red]stamp[/red]", "/scan[0]", 1, "left [bold]out", True)
+    text = run_text(replace(made_run(), losses=(loss,)))
+    assert "/scan[0]" in text
+    assert "[/red]" in text
+
+
+@pytest.mark.parametrize("changes", [True, False])
+def test_the_summary_of_a_difference_lists_what_became_louder(changes):
+    ratio = made_ratio() if changes else replace(made_ratio(), changes=())
+    report = diff_report(
+        ratio,
+        run=made_run().log.parent / "run1",
+        background=made_run().log.parent / "run3",
+        config=DiffConfig(),
+        timings_s={"compare": 0.1},
+    )
+    text = printed(diff_view({**report, "folder": "run1-run3"}))
+    assert "run1 against run3" in text
+    assert ("26.0" in text) == changes
+    assert ("no place is louder" in text) == (not changes)
+
+
+def log_summary() -> dict:
+    return {
+        "path": "run1.mcap",
+        "size_bytes": 12_300_000,
+        "duration_s": 26.7,
+        "topics": [
+            {
+                "name": "/audio/raw",
+                "schema": "audio_utils_msgs/msg/AudioFrame",
+                "encoding": "cdr",
+                "messages": 667,
+                "rate_hz": 25.0,
+                "kind": "audio",
+                "used": True,
+            },
+            {
+                "name": "/rosout",
+                "schema": "rcl_interfaces/msg/Log",
+                "encoding": "cdr",
+                "messages": 3,
+                "rate_hz": None,
+                "kind": None,
+                "used": False,
+            },
+        ],
+        "audio": {"topic": "/audio/raw", "channels": 16, "drift_ppm": -31.25, "stamp": "end"},
+        "lasers": [{"topic": "/scan[front]", "beams": 1081, "mount": {"x": 0.2, "yaw": [0.0]}}],
+        "odometry": None,
+        "mounts": {},
+        "losses": [],
+        "problems": ["no odometry: give [topics] odometry"],
+    }
+
+
+def test_the_view_of_a_log_shows_topics_sensors_and_problems():
+    text = printed(log_view(log_summary()))
+    lines = [line.split() for line in text.splitlines()]
+    assert "run1.mcap: 26.7 s, 12.3 MB" in text
+    assert any(line[:3] == ["/audio/raw", "667", "25.0"] and line[-1] == "audio" for line in lines)
+    assert any(line[:3] == ["/rosout", "3", "-"] and line[-1] == "-" for line in lines)
+    assert "channels 16, drift ppm -31.25" in text
+    assert "/scan[front]" in text
+    assert "- no odometry: give [topics] odometry" in text
