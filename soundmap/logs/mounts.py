@@ -84,14 +84,14 @@ class Mounts:
         self, tree: FrameTree, base: str, configured: Mapping[str, PlanarMount], log_name: str
     ) -> None:
         self.tree, self.base, self._log_name = tree, base, log_name
-        self._configured = {
+        self.configured = {
             name.removeprefix("/"): Mount.planar(*values) for name, values in configured.items()
         }
 
     def get(self, frame: str) -> Mount | None:
         """Where a frame is in the base frame, None if nothing says so."""
-        if frame in self._configured:
-            return self._configured[frame]
+        if frame in self.configured:
+            return self.configured[frame]
         return self.tree.mount(self.base, frame)
 
     def mount(self, frame: str, user: str) -> Mount:
@@ -109,7 +109,7 @@ class Mounts:
 
     def missing(self, frame: str, user: str) -> str:
         """What to tell about a frame whose mount is unknown."""
-        known = sorted({self.base, *self._configured, *self.tree.frames} - {""})
+        known = sorted({self.base, *self.configured, *self.tree.frames} - {""})
         near = nearest_names(frame, known)
         hint = f" Did you mean {near}?" if near else ""
         return (

@@ -174,6 +174,9 @@ class _FileWalk:
                     if batch := self._chunk(stream, offset, length):
                         yield batch
                 elif opcode in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
+                    if length > MAX_CHUNK_BYTES:
+                        self.log.count("record too long", self.file.name, "left out")
+                        continue
                     message = self._record(opcode, memoryview(stream.read(length)))
                     if message is not None:
                         loose.append(message)
@@ -272,6 +275,8 @@ class _FileWalk:
         if held is not None and not any(self.wanted(channel) for channel in held):
             return []
         try:
+            if length > MAX_CHUNK_BYTES:
+                raise ValueError(f"it is {length / 2**20:.0f} MiB long, more than is credible")
             # Checksums need no second look in later passes: a damaged chunk holds no topics.
             data = _chunk_content(stream.read(length), check=held is None)
         except _DAMAGE as error:
