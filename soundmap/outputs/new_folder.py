@@ -57,6 +57,30 @@ def new_folder(folder: Path, *, force: bool, inputs: Iterable[Path] = ()) -> Ite
         _remove_if_empty(parents)
 
 
+def folder_for(log: Path) -> Path:
+    """Where the results of a log go unless the user says otherwise: here, named as the log.
+
+    Examples
+    --------
+    >>> str(folder_for(Path("recordings/run1.mcap")))
+    'run1'
+    """
+    log = Path(os.path.realpath(log))
+    folder = Path(log.stem if log.suffix == ".mcap" else log.name)
+    return folder if folder.absolute() != log else Path(f"{log.name}-soundmap")
+
+
+def folder_for_difference(run: Path, background: Path) -> Path:
+    """Where the difference of two run folders goes unless the user says otherwise.
+
+    Examples
+    --------
+    >>> str(folder_for_difference(Path("runs/run1"), Path("runs/run3/")))
+    'run1-run3'
+    """
+    return Path(f"{run.resolve().name}-{background.resolve().name}")
+
+
 @contextmanager
 def writing(folder: Path) -> Iterator[None]:
     """What the operating system forbids while results are written, as one clear `OutputError`."""

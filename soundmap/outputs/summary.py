@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -71,11 +72,14 @@ def log_view(summary: Mapping[str, Any]) -> RenderableType:
             Text(topic["schema"], overflow="fold"),
             topic["kind"] if topic["used"] else "-",
         )
+    lasers = enumerate(summary["lasers"], start=1)
+    mounts = summary["mounts"].items()
     found = {
         "Audio": _described(summary["audio"]),
-        **{f"Laser {n}": _described(laser) for n, laser in enumerate(summary["lasers"], start=1)},
+        **{f"Laser {number}": _described(laser) for number, laser in lasers},
         "Odometry": _described(summary["odometry"]),
-        **{f"Mount of {frame}": _described(mount) for frame, mount in summary["mounts"].items()},
+        "Base frame": _value(summary["base_frame"]),
+        **{f"Mount of {frame}": _placed(mount) for frame, mount in mounts},
     }
     problems = [Text(f"- {problem}") for problem in summary["problems"]]
     return Group(
@@ -143,16 +147,20 @@ def _described(thing: Mapping[str, Any] | None) -> str:
     """Names and values of something's fields on one line."""
     if thing is None:
         return "none"
-    return ", ".join(f"{_words(name)} {_value(value)}" for name, value in thing.items())
+    fields = {name: value for name, value in thing.items() if name != "mount"}
+    return ", ".join(f"{_words(name)} {_value(value)}" for name, value in fields.items())
+
+
+def _placed(mount: Sequence[float]) -> str:
+    x, y, z, yaw = mount
+    return f"x {x:.3f}, y {y:.3f}, z {z:.3f} m, yaw {math.degrees(yaw):.1f} degrees"
 
 
 def _value(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     if isinstance(value, float):
         return f"{value:.6g}"
-    if isinstance(value, Mapping):
-        return f"({_described(value)})"
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(_value(item) for item in value)}]"
     return "-" if value is None else str(value)
 
 

@@ -101,9 +101,10 @@ def log_summary() -> dict:
             },
         ],
         "audio": {"topic": "/audio/raw", "channels": 16, "drift_ppm": -31.25, "stamp": "end"},
-        "lasers": [{"topic": "/scan[front]", "beams": 1081, "mount": {"x": 0.2, "yaw": [0.0]}}],
+        "lasers": [{"topic": "/scan[front]", "beams": 1081, "upside_down": True}],
         "odometry": None,
-        "mounts": {},
+        "base_frame": "base_link",
+        "mounts": {"laser": [0.2, -0.1, 0.3, 1.5707963]},
         "losses": [],
         "problems": ["no odometry: give [topics] odometry"],
     }
@@ -117,4 +118,6 @@ def test_the_view_of_a_log_shows_topics_sensors_and_problems():
     assert any(line[:3] == ["/rosout", "3", "-"] and line[-1] == "-" for line in lines)
     assert "channels 16, drift ppm -31.25" in text
     assert "/scan[front]" in text
+    assert "upside down yes" in text
+    assert "x 0.200, y -0.100, z 0.300 m, yaw 90.0 degrees" in text
     assert "- no odometry: give [topics] odometry" in text

@@ -1,0 +1,378 @@
+"""The command line: parse, call, print. What is slow to load is loaded inside the commands."""
+
+from __future__ import annotations
+
+import logging
+import math
+import signal
+import sys
+from collections import Counter
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from soundmap import __version__
+from soundmap.errors import DataLossError, SoundmapError
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+    from soundmap.config import Config
+
+EPILOG = """\b
+Examples:
+  soundmap info run1.mcap
+  soundmap process run1.mcap --map map.yaml
+  soundmap process run1.mcap run3.mcap --map map.yaml --config robot.toml
+  soundmap diff run1 run3
+
+\b
+Exit codes: 0 done, 1 failed, 2 wrong usage or configuration, 3 unreadable
+input, 4 nothing usable in the log, 5 --strict and data was lost.
+"""
+
+
+class Commands(TyperGroup):
+    """All commands, with the one place where the errors that a user can mend are caught."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command that was asked for."""
+        try:
+            return super().invoke(ctx)
+        except SoundmapError as error:
+            _show_error(error)
+            raise typer.Exit(error.exit_code) from None
+        except KeyboardInterrupt:
+            print("soundmap: stopped; nothing was left half written.", file=sys.stderr)
+            raise typer.Exit(130) from None
+
+
+app = typer.Typer(
+    cls=Commands,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    epilog=EPILOG,
+)
+
+LogArgument = Annotated[
+    Path, typer.Argument(metavar="LOG", help="Recorded log: an .mcap file or a rosbag2 folder.")
+]
+LogsArgument = Annotated[
+    list[Path],
+    typer.Argument(metavar="LOG", help="Recorded logs: .mcap files or rosbag2 folders."),
+]
+ConfigOption = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--config",
+        metavar="FILE",
+        help="Settings to use instead of the defaults, as TOML. May be repeated: a later file "
+        "overrides an earlier one key by key. Default: configs/default.toml's values.",
+    ),
+]
+ForceOption = Annotated[
+    bool,
+    typer.Option(
+        "--force",
+        help="Replace the folder of an earlier run, with all that is in it, once the new one is "
+        "complete. Without it, a folder that is not empty is refused.",
+    ),
+]
+QuietOption = Annotated[
+    bool, typer.Option("--quiet", "-q", help="Print nothing but errors: no progress, no summary.")
+]
+JsonOption = Annotated[
+    bool,
+    typer.Option("--json", help="Print one JSON object on the standard output and nothing else."),
+]
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        print(f"soundmap {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def soundmap(
+    *,
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_version, is_eager=True, help="Print the version."),
+    ] = False,
+) -> None:
+    """Find where noise comes from, how loud it is, and what has changed, from a robot's logs."""
+
+
+@app.command()
+def info(log: LogArgument, config: ConfigOption = None, *, as_json: JsonOption = False) -> None:
+    """Show what a log holds and what of it would be used.
+
+    Topics, clocks, gaps, mounts, and the problems that processing it would meet.
+    """
+    from soundmap.logs.summary import log_summary
+    from soundmap.outputs.summary import log_view
+
+    summary = log_summary(log, _config(config)).as_dict()
+    _print(summary, log_view, as_json=as_json)
+
+
+@app.command()
+def process(
+    logs: LogsArgument,
+    map_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--map",
+            metavar="MAP.yaml",
+            help="Geometric map of the site: a map_server YAML file, which names its image. "
+            "Needed for now.",
+        ),
+    ] = None,
+    config: ConfigOption = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Folder to write. With several logs, the folder in which each gets its own. "
+            "Default: a folder here with the name of the log.",
+        ),
+    ] = None,
+    start_pose: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y,DEG",
+            help="Where in the map the robot starts: x and y in metres, heading in degrees "
+            "counter-clockwise from the x axis. Default: it is searched for in the whole map.",
+        ),
+    ] = None,
+    *,
+    force: ForceOption = False,
+    strict: Annotated[
+        bool,
+        typer.Option(
+            "--strict",
+            help="Exit with code 5 if any data of the log was lost. The results are written all "
+            "the same.",
+        ),
+    ] = False,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Locate the noise sources of one log or several.
+
+    Writes a folder a log: sources, power map, trajectory, pictures, report.
+    """
+    if map_file is None:
+        raise typer.BadParameter(
+            "a geometric map is needed for now: --map MAP.yaml, a map_server map of the site",
+            param_hint="'--map'",
+        )
+    start = _parsed_start_pose(start_pose)
+    folders = _run_folders(logs, out)
+    settings = _config(config)
+    outcomes = []
+    for log, folder in zip(logs, folders, strict=True):
+        try:
+            report = _processed(
+                log, folder, map_file, settings, start=start, force=force, quiet=quiet or as_json
+            )
+            outcomes.append({**report, "folder": str(folder)})
+        except SoundmapError as error:
+            if len(logs) == 1:
+                raise
+            _show_error(error)
+            outcomes.append({"log": log.name, "error": str(error), "exit_code": error.exit_code})
+    _show_runs(outcomes, quiet=quiet, as_json=as_json)
+    _exit_unless_good(outcomes, strict=strict)
+
+
+@app.command()
+def diff(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of the run to be looked at.")],
+    background: Annotated[
+        Path,
+        typer.Argument(
+            metavar="BACKGROUND", help="Folder of a run of the same site to compare with."
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="Folder to write. Default: a folder here named RUN-BACKGROUND."
+        ),
+    ] = None,
+    config: ConfigOption = None,
+    *,
+    force: ForceOption = False,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Show what is louder in one run than in another.
+
+    Writes a folder with the difference of the two power maps in dB and its local maxima.
+    """
+    from soundmap.outputs.new_folder import folder_for_difference, new_folder
+    from soundmap.outputs.run_folder import write_diff
+    from soundmap.outputs.summary import diff_view
+    from soundmap.replay import compared
+
+    settings = _config(config)
+    folder = out if out is not None else folder_for_difference(run, background)
+    compared_files = [run / "map.yaml", background / "map.yaml"]
+    with new_folder(folder, force=force, inputs=compared_files) as new:
+        began = perf_counter()
+        comparison = compared(run, background, settings.diff, settings.detect)
+        timings_s = {"compare": perf_counter() - began}
+        report = write_diff(
+            comparison.ratio,
+            new,
+            room=comparison.room,
+            run=run,
+            background=background,
+            config=settings.diff,
+            timings_s=timings_s,
+        )
+    if not quiet or as_json:
+        _print({**report, "folder": str(folder)}, diff_view, as_json=as_json)
+
+
+def main() -> None:
+    """Entry point of the ``soundmap`` command."""
+    signal.signal(signal.SIGTERM, _stop)
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it tells of its font cache otherwise
+    app(prog_name="soundmap")
+
+
+def _stop(number: int, _frame: object) -> None:
+    raise SystemExit(128 + number)
+
+
+def _config(files: list[Path] | None) -> Config:
+    from soundmap.config import loaded_config
+
+    return loaded_config(files or [])
+
+
+def _processed(
+    log: Path,
+    folder: Path,
+    map_file: Path,
+    config: Config,
+    *,
+    start: tuple[float, float, float] | None,
+    force: bool,
+    quiet: bool,
+) -> dict[str, Any]:
+    """Process one log into its folder and give the report."""
+    from soundmap.outputs.new_folder import new_folder
+    from soundmap.outputs.progress import chosen_progress
+    from soundmap.outputs.run_folder import write_run
+
+    with new_folder(folder, force=force, inputs=[log]) as new:
+        from soundmap.replay import process as processed
+
+        run = processed(
+            log, map_file, config, start_pose=start, progress=chosen_progress(quiet=quiet)
+        )
+        return write_run(run, new)
+
+
+def _run_folders(logs: list[Path], out: Path | None) -> list[Path]:
+    """One folder a log, in the order of the logs."""
+    from soundmap.outputs.new_folder import folder_for
+
+    if out is not None and len(logs) == 1:
+        return [out]
+    folders = [folder_for(log) for log in logs]
+    if out is not None:
+        folders = [out / folder.name for folder in folders]
+    if shared := [str(folder) for folder, count in Counter(folders).items() if count > 1]:
+        raise typer.BadParameter(
+            f"more than one log would be written to {', '.join(shared)}: process them one by one "
+            "with --out",
+            param_hint="'LOG...'",
+        )
+    return folders
+
+
+def _parsed_start_pose(text: str | None) -> tuple[float, float, float] | None:
+    """X,Y,DEG as metres and radians."""
+    if text is None:
+        return None
+    try:
+        x, y, degrees = (float(part) for part in text.split(","))
+    except ValueError:
+        x = y = degrees = math.nan
+    if not all(math.isfinite(number) for number in (x, y, degrees)):
+        raise typer.BadParameter(
+            f"{text!r} is no start pose: give x and y in metres and the heading in degrees, "
+            "separated by commas, as in --start-pose 1.2,-0.5,90",
+            param_hint="'--start-pose'",
+        )
+    return x, y, math.radians(degrees)
+
+
+def _show_runs(outcomes: list[dict[str, Any]], *, quiet: bool, as_json: bool) -> None:
+    from soundmap.outputs.summary import run_view
+
+    if as_json and len(outcomes) > 1:
+        _print({"runs": outcomes}, run_view, as_json=True)
+    elif as_json or not quiet:
+        for outcome in outcomes:
+            if "error" not in outcome:
+                _print(outcome, run_view, as_json=as_json)
+
+
+def _exit_unless_good(outcomes: list[dict[str, Any]], *, strict: bool) -> None:
+    """Exit with the worst code of several logs; a failure is worse than a loss."""
+    failures = [outcome["exit_code"] for outcome in outcomes if "error" in outcome]
+    if strict:
+        for outcome in outcomes:
+            lost = [loss for loss in outcome.get("losses", ()) if loss["data_lost"]]
+            if lost:
+                error = DataLossError(
+                    f"{outcome['log']}: data was lost ({lost[0]['where']}: {lost[0]['what']}"
+                    f"{' and more' if len(lost) > 1 else ''}) and --strict was given. "
+                    f"The results are in {outcome['folder']}/."
+                )
+                _show_error(error)
+                failures.append(0)
+    if failures:
+        raise typer.Exit(max(failures) or DataLossError.exit_code)
+
+
+def _print(
+    content: Mapping[str, Any],
+    view: Callable[[Mapping[str, Any]], RenderableType],
+    *,
+    as_json: bool,
+) -> None:
+    """Print a result for a program or for a person."""
+    if as_json:
+        from soundmap.outputs.report import json_text
+
+        print(json_text(content))
+    else:
+        from rich.console import Console
+
+        Console(highlight=False).print(view(content))
+
+
+def _show_error(error: SoundmapError) -> None:
+    """One panel on a terminal; plain, unbroken lines anywhere else."""
+    if not sys.stderr.isatty():
+        print(f"soundmap: error: {error}", file=sys.stderr)
+        return
+    from rich.console import Console
+    from rich.panel import Panel
+    from rich.text import Text
+
+    panel = Panel(Text(str(error)), title="soundmap: error", border_style="red")
+    Console(stderr=True).print(panel)
