@@ -237,6 +237,11 @@ class Trajectory:
         outside = (wanted < self.time_ns[0]) | (wanted > self.time_ns[-1])
         return np.where(outside[..., None], np.nan, pose)
 
+    def driven_m(self) -> FloatArray:
+        """Distance driven from the first pose to each, along the poses [m], shape (K,)."""
+        step = np.diff(self.pose[:, :2], axis=0)
+        return np.concatenate([np.zeros(min(len(self), 1)), np.cumsum(np.hypot(*step.T))])
+
     def usable_at(self, time_ns: ArrayLike) -> NDArray[np.bool_]:
         """Whether the poses on both sides of each time may be trusted; False outside the span."""
         wanted = np.asarray(time_ns, dtype=np.int64)

@@ -16,7 +16,7 @@ from soundmap.geometry import FloatArray, inverted, transformed
 from soundmap.grid import GridFrame, OccupancyGrid
 
 FREE_PIXEL, OCCUPIED_PIXEL, UNKNOWN_PIXEL = 254, 0, 205
-OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.25
+OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196
 MAX_CELLS = 400_000_000
 """A map of 1 km x 1 km at 5 cm; anything larger is taken for a mistake."""
 
@@ -115,12 +115,17 @@ def _read_image(path: Path, description: dict[str, Any]) -> NDArray[np.uint8]:
 def _classified(
     image: NDArray[np.uint8], description: dict[str, Any]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which cells are occupied and which are free, by map_server's thresholds."""
+    """Which cells are occupied and which are free, by map_server's thresholds.
+
+    Savers write 205 for unknown whatever thresholds they state; nav2's free_thresh of 0.25 would
+    make it free.
+    """
     if description.get("mode") == "raw":
         known = image <= 100
         occupancy = np.where(known, image / 100.0, np.nan)
     else:
-        occupancy = (image if description.get("negate") else 255 - image.astype(np.float64)) / 255.0
+        dark = image if description.get("negate") else 255 - image
+        occupancy = np.where(image == UNKNOWN_PIXEL, np.nan, dark / 255.0)
     high = float(description.get("occupied_thresh", OCCUPIED_THRESHOLD))
     low = float(description.get("free_thresh", FREE_THRESHOLD))
     return occupancy > high, occupancy < low

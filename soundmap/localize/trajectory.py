@@ -17,7 +17,7 @@ import numpy as np
 from soundmap.config import LocalizeConfig
 from soundmap.deskew import Rays, deskewed_rays
 from soundmap.errors import MapError, NothingUsableError
-from soundmap.geometry import FloatArray, Trajectory, relative, transformed
+from soundmap.geometry import FloatArray, Trajectory, composed, relative, transformed
 from soundmap.grid import OccupancyGrid
 from soundmap.localize.global_start import start_hypotheses
 from soundmap.localize.particle_filter import ParticleFilter
@@ -29,6 +29,10 @@ LEAST_RAYS = 10
 """A scan with fewer returns says too little about the pose."""
 LOST_AFTER_S = 2.0
 """Without a match for this long, the pose is sought in the whole map."""
+ODOMETRY_DRIFT = 0.2
+"""Worst drift of any odometry in use [m/m and rad/m]."""
+ELSEWHERE_MATCH = 0.8
+"""Share of a scan that must match to believe that the robot is where odometry cannot have led."""
 OPENING_NS = 300_000_000
 """Scans this close together are matched to the map as one."""
 MOST_PENDING = 20_000
@@ -41,6 +45,7 @@ class View:
 
     rays: Rays
     odometry: FloatArray
+    driven_m: float
     is_new_place: bool
     scanner: int
     range_max_m: float
@@ -48,12 +53,17 @@ class View:
 
 @dataclass(frozen=True)
 class Fix:
-    """A pose, the share of the scan that the map explains there, and whether to trust it."""
+    """The pose found for a view, the share of it that the map explains, and whether to trust it."""
 
-    time_ns: int
+    view: View
     pose: FloatArray
     matched: float
     usable: bool
+
+    @property
+    def time_ns(self) -> int:
+        """Time of the pose [ns since epoch]."""
+        return self.view.rays.time_ns
 
 
 def estimate_trajectory(
@@ -121,7 +131,7 @@ def _views(
     last_used: dict[int, View] = {}
     last_new: dict[int, View] = {}
     passed_over: dict[int, LaserScan] = {}
-    witness = _StandstillWitness(odometry)
+    witness, look = _StandstillWitness(odometry), _Look(odometry, config.beams)
     for scan in lasers:
         place = odometry.at(scan.middle_ns)
         if not np.isfinite(place).all():
@@ -133,7 +143,7 @@ def _views(
         if not is_new and waited_s < config.update_interval_s:
             passed_over[scan.scanner] = scan
             continue
-        view = _view(scan, odometry, is_new, config)
+        view = look.at(scan, is_new)
         if len(view.rays) < LEAST_RAYS:
             losses.add("laser scan with too few returns", STAGE, effect="scan not used")
             continue
@@ -149,7 +159,7 @@ def _views(
             "be localized. `soundmap info` shows what the log holds."
         )
     for scan in sorted(passed_over.values(), key=lambda scan: scan.middle_ns):
-        yield _view(scan, odometry, False, config)
+        yield look.at(scan, False)
 
 
 def _is_new_place(step: FloatArray, config: LocalizeConfig) -> bool:
@@ -157,10 +167,23 @@ def _is_new_place(step: FloatArray, config: LocalizeConfig) -> bool:
     return bool(moved_m >= config.update_distance_m or turned_rad >= config.update_angle_rad)
 
 
-def _view(scan: LaserScan, odometry: Trajectory, is_new: bool, config: LocalizeConfig) -> View:
-    time_ns = scan.middle_ns
-    rays = deskewed_rays(scan, odometry, time_ns, most=config.beams)
-    return View(rays, odometry.at(time_ns), is_new, scan.scanner, scan.range_max_m)
+class _Look:
+    """Turns laser scans into views along one odometry."""
+
+    def __init__(self, odometry: Trajectory, most_rays: int) -> None:
+        self._odometry, self._most_rays = odometry, most_rays
+        self._driven_m = odometry.driven_m()
+
+    def at(self, scan: LaserScan, is_new_place: bool) -> View:
+        time_ns = scan.middle_ns
+        return View(
+            rays=deskewed_rays(scan, self._odometry, time_ns, most=self._most_rays),
+            odometry=self._odometry.at(time_ns),
+            driven_m=float(np.interp(time_ns, self._odometry.time_ns, self._driven_m)),
+            is_new_place=is_new_place,
+            scanner=scan.scanner,
+            range_max_m=scan.range_max_m,
+        )
 
 
 class _StandstillWitness:
@@ -204,6 +227,7 @@ class _Localizer:
         self._filter: ParticleFilter | None = None
         self._odometry = np.zeros(3)
         self._pending: list[tuple[int, View]] = []
+        self._anchor: Fix | None = None
         self._recent: dict[int, View] = {}
         self._matched_ns = 0
         self._patience_s = LOST_AFTER_S
@@ -232,6 +256,7 @@ class _Localizer:
             self._filter.correct(view.rays)
         fix = self._fix(self._filter, view)
         self.fixes.append(fix)
+        self._anchor = fix if fix.usable else self._anchor
         if fix.matched >= self._config.min_match:
             self._matched_ns, self._patience_s = view.rays.time_ns, LOST_AFTER_S
         if fix.usable:
@@ -254,8 +279,11 @@ class _Localizer:
     def _fix(self, particle_filter: ParticleFilter, view: View) -> Fix:
         estimate = particle_filter.estimate()
         matched = particle_filter.matched(estimate, view.rays)
-        usable = matched >= self._config.min_match and particle_filter.concentrated(estimate)
-        return Fix(view.rays.time_ns, estimate.pose, matched, usable)
+        needed = self._config.min_match
+        if self._anchor is not None and not _consistent(self._anchor, view, estimate.pose):
+            needed = max(needed, ELSEWHERE_MATCH)
+        usable = matched >= needed and particle_filter.concentrated(estimate)
+        return Fix(view, estimate.pose, matched, usable)
 
     def _look_back(self, particle_filter: ParticleFilter) -> None:
         """Run back over the views that came before the particles agreed."""
@@ -285,6 +313,15 @@ class _Localizer:
             STAGE,
             effect="pose sought in the whole map",
         )
+
+
+def _consistent(anchor: Fix, view: View, pose: FloatArray) -> bool:
+    """Whether the odometry can have led from a trusted pose to this one."""
+    expected = composed(anchor.pose, relative(anchor.view.odometry, view.odometry))
+    driven_m = abs(view.driven_m - anchor.view.driven_m)
+    off = relative(expected, pose)
+    near = np.hypot(off[0], off[1]) <= 0.5 + ODOMETRY_DRIFT * driven_m
+    return bool(near and abs(off[2]) <= np.radians(20.0) + ODOMETRY_DRIFT * driven_m)
 
 
 def _joined_rays(views: list[View], reference: View) -> Rays:

@@ -1,0 +1,202 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from soundmap.config import LocalizeConfig
+from soundmap.deskew import deskewed_rays
+from soundmap.errors import MapError, NothingUsableError
+from soundmap.geometry import Trajectory, composed, relative, wrapped_angle
+from soundmap.grid import GridFrame, OccupancyGrid
+from soundmap.localize.global_start import start_hypotheses
+from soundmap.localize.trajectory import estimate_trajectory
+from soundmap.losses import LossLedger
+from tests import worlds
+
+LOOP = [(1.0, 1.0), (5.5, 1.2), (4.0, 2.2), (1.2, 4.2), (1.0, 1.5)]
+TRUTH = worlds.driven(LOOP)
+SCANS = worlds.laser_scans(TRUTH, [worlds.FRONT, worlds.BACK])
+ROOM = worlds.room()
+CONFIG = LocalizeConfig(particles=300)
+
+
+def odometry_of(truth, *, scale=1.0, turn_scale=1.0, drift_rad_per_m=0.0):
+    """What wheels with systematic errors would say; starts at the origin."""
+    step = relative(truth.pose[:-1], truth.pose[1:])
+    length = np.hypot(step[:, 0], step[:, 1])
+    step = step * [scale, scale, turn_scale]
+    step[:, 2] += drift_rad_per_m * length
+    pose = [np.zeros(3)]
+    for part in step:
+        pose.append(composed(pose[-1], part))
+    return Trajectory(truth.time_ns, np.array(pose), truth.usable)
+
+
+def errors(estimate, truth=TRUTH):
+    off = estimate.pose - truth.at(estimate.time_ns)
+    return np.hypot(off[:, 0], off[:, 1]), np.abs(wrapped_angle(off[:, 2]))
+
+
+START = tuple(TRUTH.pose[0])
+
+
+def test_with_perfect_sensors_the_filter_follows_the_truth_within_a_cell():
+    estimate = estimate_trajectory(SCANS, odometry_of(TRUTH), ROOM, CONFIG, start_pose=START)
+    position, heading = errors(estimate)
+    assert estimate.usable.all()
+    assert position.max() < 0.05
+    assert np.degrees(heading).mean() < 0.3
+    assert estimate.time_ns[0] <= SCANS[0].middle_ns
+    assert estimate.time_ns[-1] == max(scan.middle_ns for scan in SCANS)
+
+
+def test_without_a_start_pose_the_robot_is_found_in_the_map():
+    estimate = estimate_trajectory(SCANS, odometry_of(TRUTH), ROOM, CONFIG)
+    position, _ = errors(estimate)
+    assert estimate.usable.mean() > 0.95
+    assert position[estimate.usable].max() < 0.06
+
+
+def test_a_wrong_start_pose_is_recovered_from():
+    losses = LossLedger()
+    wrong = (4.0, 0.6, 2.0)
+    estimate = estimate_trajectory(
+        SCANS, odometry_of(TRUTH), ROOM, CONFIG, start_pose=wrong, losses=losses
+    )
+    position, _ = errors(estimate)
+    assert position[estimate.usable].max() < 0.06
+    assert estimate.usable[len(estimate) // 3 :].all()
+    assert any("stopped matching" in loss.what for loss in losses)
+
+
+def test_systematic_odometry_errors_do_not_lose_the_robot():
+    odometry = odometry_of(TRUTH, scale=1.05, turn_scale=0.96, drift_rad_per_m=np.radians(3.0))
+    estimate = estimate_trajectory(SCANS, odometry, ROOM, CONFIG)
+    position, heading = errors(estimate)
+    assert estimate.usable.mean() > 0.95
+    assert np.quantile(position[estimate.usable], 0.95) < 0.06
+    assert np.degrees(heading[estimate.usable]).mean() < 0.6
+
+
+def test_one_scanner_is_enough():
+    front = [scan for scan in SCANS if scan.scanner == 0]
+    position, _ = errors(estimate_trajectory(front, odometry_of(TRUTH), ROOM, CONFIG))
+    assert np.quantile(position, 0.95) < 0.06
+
+
+def test_a_run_that_begins_with_heading_180_degrees_does_not_flip():
+    truth = worlds.driven([(5.5, 1.2), (1.0, 1.2), (1.0, 1.6)])
+    scans = worlds.laser_scans(truth, [worlds.FRONT])
+    estimate = estimate_trajectory(
+        scans, odometry_of(truth), ROOM, CONFIG, start_pose=tuple(truth.pose[0])
+    )
+    position, heading = errors(estimate, truth)
+    assert position.max() < 0.06
+    assert np.degrees(heading.max()) < 2.0
+
+
+def test_obstacles_that_the_map_lacks_do_not_pull_the_pose():
+    rng = np.random.default_rng(0)
+    blocked = []
+    for scan in SCANS:
+        ranges = scan.range_m.copy()
+        first = rng.integers(0, len(ranges))
+        hidden = (np.arange(len(ranges)) + first) % len(ranges) < 0.3 * len(ranges)
+        ranges[hidden] = np.minimum(ranges[hidden], rng.uniform(0.4, 0.8))
+        blocked.append(replace(scan, range_m=ranges))
+    estimate = estimate_trajectory(blocked, odometry_of(TRUTH), ROOM, CONFIG)
+    position, _ = errors(estimate)
+    assert estimate.usable.mean() > 0.9
+    assert np.quantile(position[estimate.usable], 0.95) < 0.08
+
+
+def test_the_same_input_gives_the_same_trajectory():
+    short = SCANS[:120]
+    first, second = (estimate_trajectory(short, odometry_of(TRUTH), ROOM, CONFIG) for _ in range(2))
+    assert np.array_equal(first.pose, second.pose)
+    assert np.array_equal(first.time_ns, second.time_ns)
+
+
+def test_hypotheses_of_a_symmetric_room_hold_both_of_its_ends():
+    frame = GridFrame(0.05, (0.0, 0.0), (60, 120))
+    occupied = np.zeros(frame.shape, dtype=bool)
+    occupied[[10, 50], 10:111] = True
+    occupied[10:51, [10, 110]] = True
+    free = np.zeros(frame.shape, dtype=bool)
+    free[11:50, 11:110] = True
+    room = OccupancyGrid(frame, occupied, free)
+    bearing = np.linspace(-np.pi, np.pi, 180, endpoint=False)
+    pose = np.array([2.0, 1.0, 0.4])
+    direction = bearing + pose[2]
+    with np.errstate(divide="ignore"):
+        along_x = np.where(np.cos(direction) > 0, 5.525 - 2.0, 2.0 - 0.525) / abs(np.cos(direction))
+        along_y = np.where(np.sin(direction) > 0, 2.525 - 1.0, 1.0 - 0.525) / abs(np.sin(direction))
+    ranges = np.minimum(along_x, along_y)
+    scan = replace(
+        SCANS[0], ray_interval_ns=0.0, bearing_rad=bearing, range_m=ranges, mount=worlds.FRONT
+    )
+    rays = deskewed_rays(scan, TRUTH, scan.middle_ns, most=90)
+    hypotheses, score = start_hypotheses(room, rays)
+    base = composed(pose, [-0.2, 0.0, 0.0])
+    mirrored = np.array([6.05 - base[0], 3.05 - base[1], base[2] - np.pi])
+    for expected in (base, mirrored):
+        off = hypotheses - expected
+        near = np.hypot(off[:, 0], off[:, 1]) + np.abs(wrapped_angle(off[:, 2]))
+        assert near.min() < 0.1
+        assert score[near.argmin()] > 0.9 * score.max()
+
+
+class TestFaults:
+    def test_odometry_that_stands_still_while_the_view_changes(self):
+        stuck = Trajectory(TRUTH.time_ns, np.zeros_like(TRUTH.pose), TRUTH.usable)
+        with pytest.raises(NothingUsableError, match="odometry never moves"):
+            estimate_trajectory(SCANS, stuck, ROOM, CONFIG)
+
+    def test_a_robot_that_really_stands_still_is_localized(self):
+        still = SCANS[:8]
+        stuck = Trajectory(TRUTH.time_ns, np.zeros_like(TRUTH.pose), TRUTH.usable)
+        estimate = estimate_trajectory(still, stuck, ROOM, CONFIG, start_pose=START)
+        assert errors(estimate)[0].max() < 0.08
+
+    def test_scans_without_returns(self):
+        empty = [replace(scan, range_m=np.full_like(scan.range_m, np.nan)) for scan in SCANS]
+        losses = LossLedger()
+        with pytest.raises(NothingUsableError, match="no laser scan has enough returns"):
+            estimate_trajectory(empty, odometry_of(TRUTH), ROOM, CONFIG, losses=losses)
+        assert next(iter(losses)).count == len(SCANS)
+
+    def test_no_scans_at_all(self):
+        with pytest.raises(NothingUsableError, match="no laser scan"):
+            estimate_trajectory([], odometry_of(TRUTH), ROOM, CONFIG)
+
+    def test_the_map_of_another_site(self):
+        rng = np.random.default_rng(1)
+        other = OccupancyGrid(
+            GridFrame(0.05, (0.0, 0.0), (200, 200)),
+            rng.random((200, 200)) < 0.002,
+            np.ones((200, 200), dtype=bool),
+        )
+        with pytest.raises(MapError, match="do not match the map"):
+            estimate_trajectory(SCANS[:200], odometry_of(TRUTH), other, CONFIG)
+
+    def test_a_map_that_covers_only_part_of_the_run_flags_the_rest(self):
+        occupied = ROOM.occupied.copy()
+        occupied[:, ROOM.frame.cells([3.0, 0.0])[1] :] = False
+        half = OccupancyGrid(ROOM.frame, occupied, ROOM.free)
+        losses = LossLedger()
+        estimate = estimate_trajectory(
+            SCANS, odometry_of(TRUTH), half, CONFIG, start_pose=START, losses=losses
+        )
+        position, _ = errors(estimate)
+        assert 0.1 < estimate.usable.mean() < 0.95
+        assert np.quantile(position[estimate.usable], 0.95) < 0.25
+        assert any(loss.what == "robot not localized" for loss in losses)
+
+    def test_odometry_that_ends_early_ends_the_trajectory(self):
+        half = len(TRUTH) // 2
+        odometry = odometry_of(TRUTH)
+        cut = Trajectory(odometry.time_ns[:half], odometry.pose[:half], odometry.usable[:half])
+        losses = LossLedger()
+        estimate = estimate_trajectory(SCANS, cut, ROOM, CONFIG, start_pose=START, losses=losses)
+        assert estimate.time_ns[-1] <= cut.time_ns[-1]
+        assert next(iter(losses)).what == "laser scan without odometry"
