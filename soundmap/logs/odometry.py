@@ -18,9 +18,6 @@ from soundmap.losses import LossLedger
 MIN_QUATERNION_NORM = 1e-3
 """A quaternion shorter than this was never set."""
 
-SHORT_GAP_S = 0.25
-"""Without a twist, poses on both sides of so short a gap are joined by a straight line."""
-
 
 class OdometryRecord:
     """Odometry messages of one topic as they come, compactly.
@@ -163,15 +160,14 @@ def _bridged(
     """
     dt = np.diff(time_ns) * 1e-9
     driven = _driven(twist, dt)
-    result = pose.copy()
-    result[~sound] = 0.0
     good = np.flatnonzero(sound)
-    anchor = np.zeros(3) if not len(good) else pose[good[0]]
-    first = int(good[0]) if len(good) else len(pose)
+    if not len(good):
+        return _path(driven)
+    result = pose.copy()
+    first = int(good[0])
     # Before the first sound pose: drive backward from it.
-    if first > 0:
-        path = _path(driven[:first])
-        result[: first + 1] = composed(composed(anchor, inverted(path[-1])), path)[: len(pose)]
+    path = _path(driven[:first])
+    result[: first + 1] = composed(composed(pose[first], inverted(path[-1])), path)
     shift = np.zeros(3)  # From the frame of the recorded poses to that of the result.
     for a, b in zip(good.tolist(), [*good[1:].tolist(), len(pose)], strict=True):
         result[a] = composed(shift, pose[a])

@@ -212,9 +212,19 @@ class Survey:
                 taker = self._takers[message.channel] = self._taker(message.channel)
             taker(message)
             self.messages += 1
+        self._remark_on_built_in_types()
         times = [(t.first_ns, t.last_ns) for t in self.topics.values() if t.messages]
         if times:
             self.start_ns, self.end_ns = min(t[0] for t in times), max(t[1] for t in times)
+
+    def _remark_on_built_in_types(self) -> None:
+        bare = [t.name for t in self.topics.values() if t.built_in and t.kind is not Kind.OTHER]
+        self.losses.remark(
+            "type without a definition in the log",
+            ", ".join(sorted(bare)),
+            count=len(bare),
+            effect="the well-known definition of that name is used",
+        )
 
     def of_kind(self, kind: Kind) -> list[Topic]:
         """Topics of a kind, in alphabetical order."""
