@@ -1,0 +1,227 @@
+"""The whole pipeline on one page: log, localize, scan, fuse, detect."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Protocol, TypeVar
+
+import numpy as np
+
+from soundmap.config import Config, DetectConfig, DiffConfig
+from soundmap.detect.difference import changed_places, power_ratio
+from soundmap.detect.source_list import detect_sources
+from soundmap.errors import NothingUsableError, OutputError
+from soundmap.fuse.accumulate import PowerAccumulator
+from soundmap.fuse.power_map import fused_scans, level_reference, power_map_frame
+from soundmap.grid import OccupancyGrid
+from soundmap.localize.trajectory import estimate_trajectory
+from soundmap.logs.robot_log import RobotLog, open_log
+from soundmap.map_file import read_map
+from soundmap.outputs.progress import Progress, Stage
+from soundmap.outputs.run_folder import read_power_map
+from soundmap.run import Run
+from soundmap.scan.audio_scan import audio_scans
+from soundmap.sound import AudioScan, AudioScans, LevelReference, PowerRatio
+
+
+def process(
+    log_path: Path,
+    map_path: Path,
+    config: Config,
+    *,
+    start_pose: tuple[float, float, float] | None = None,
+    progress: Progress,
+) -> Run:
+    """Sources, power map and trajectory of one log in a given geometric map.
+
+    Parameters
+    ----------
+    log_path : Path
+        An MCAP file or a rosbag2 folder.
+    map_path : Path
+        map_server's YAML file.
+    config : Config
+    start_pose : tuple of float, optional
+        x [m], y [m], heading [rad] in the map; without it, it is found in the map.
+    progress : Progress
+
+    Raises
+    ------
+    SoundmapError
+        The log, the map or the configuration does not do.
+    """
+    room = read_map(map_path)
+    clock = _Stopwatch(progress)
+    with clock.stage("read"):
+        log = open_log(log_path, config)
+    array = log.array
+    if array is None:
+        raise ValueError("the log was opened without audio")
+    start_ns, duration_s = int(log.odometry.time_ns[0]), log.duration_s
+
+    with clock.stage("localize", duration_s) as stage:
+        lasers = _watched(log.lasers(), stage, start_ns)
+        trajectory = estimate_trajectory(
+            lasers, log.odometry, room, config.localize, start_pose=start_pose, losses=log.losses
+        )
+    with clock.stage("scan and fuse", duration_s) as stage:
+        reference = level_reference(array.pascal_per_count)
+        accumulator = PowerAccumulator(power_map_frame(room, config.fuse.cell_m), reference)
+        keeper = _Keeper()
+        scans = keeper.kept(audio_scans(log.audio(), array, config.scan, losses=log.losses))
+        fused = 0
+        for scan in fused_scans(
+            _watched(scans, stage, start_ns),
+            log.lasers(),
+            trajectory,
+            accumulator,
+            array.mount,
+            config.fuse,
+            losses=log.losses,
+        ):
+            fused += scan.point_m is not None
+    if not len(keeper):
+        raise NothingUsableError(
+            f"{log_path}: the audio is too short or too broken for one audio scan of "
+            f"{config.scan.frames} windows."
+        )
+    with clock.stage("detect"):
+        power_map = accumulator.power_map()
+        sources = detect_sources(power_map, config.detect)
+    return Run(
+        log=log_path,
+        fingerprint=log.fingerprint,
+        config=config,
+        room=room,
+        trajectory=trajectory,
+        scans=keeper.audio_scans(reference),
+        power_map=power_map,
+        sources=sources,
+        losses=tuple(log.losses),
+        counts=_counts(log, len(trajectory), len(keeper), fused),
+        timings_s=clock.timings_s,
+        duration_s=duration_s,
+    )
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The results of ``soundmap diff``.
+
+    Attributes
+    ----------
+    ratio : PowerRatio
+    room : OccupancyGrid
+        The geometric map of the run.
+    run, background : Path
+        The two run folders.
+    """
+
+    ratio: PowerRatio
+    room: OccupancyGrid
+    run: Path
+    background: Path
+
+
+def compared(run: Path, background: Path, diff: DiffConfig, detect: DetectConfig) -> Comparison:
+    """Difference in dB of the power maps of two run folders, Sect. 4.
+
+    Raises
+    ------
+    SoundmapError
+        One of them is no run folder, or the two cannot be compared.
+    """
+    loud, loud_share = read_power_map(run)
+    quiet, quiet_share = read_power_map(background)
+    if loud.reference != quiet.reference:
+        raise OutputError(
+            f"{run} is in {loud.reference}, {background} in {quiet.reference}: process both with "
+            "the same pascal_per_count."
+        )
+    if not quiet.visits.any():
+        raise OutputError(f"{background}: the power map holds no measurement to compare with.")
+    ratio_db, measured = power_ratio(
+        loud.power(min_visit_share=loud_share),
+        loud.frame,
+        quiet.power(min_visit_share=quiet_share),
+        quiet.frame,
+    )
+    ratio = changed_places(
+        ratio_db,
+        loud.visits,
+        measured,
+        loud.frame,
+        separation_m=detect.separation_m,
+        min_ratio_db=diff.min_ratio_db,
+    )
+    return Comparison(ratio, read_map(run / "map.yaml"), run, background)
+
+
+class _Keeper:
+    """Keeps every audio scan that passes, in single precision."""
+
+    def __init__(self) -> None:
+        self._time_ns: list[int] = []
+        self._power: list[np.ndarray[tuple[int], np.dtype[np.float32]]] = []
+        self._bearing_rad = np.empty(0)
+
+    def __len__(self) -> int:
+        return len(self._time_ns)
+
+    def kept(self, scans: Iterable[AudioScan]) -> Iterator[AudioScan]:
+        for scan in scans:
+            self._time_ns.append(scan.time_ns)
+            self._power.append(scan.power.astype(np.float32))
+            self._bearing_rad = scan.bearing_rad
+            yield scan
+
+    def audio_scans(self, reference: LevelReference) -> AudioScans:
+        time_ns = np.array(self._time_ns, dtype=np.int64)
+        return AudioScans(time_ns, self._bearing_rad, np.array(self._power), reference)
+
+
+class _Stopwatch:
+    """Times the stages while it shows their progress."""
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+        self.timings_s: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str, total_s: float | None = None) -> Iterator[Stage]:
+        began = perf_counter()
+        with self._progress.stage(name, total_s) as stage:
+            yield stage
+        self.timings_s[name] = perf_counter() - began
+
+
+class _Timed(Protocol):
+    @property
+    def time_ns(self) -> int: ...
+
+
+_Item = TypeVar("_Item", bound=_Timed)
+
+
+def _watched(items: Iterable[_Item], stage: Stage, start_ns: int) -> Iterator[_Item]:
+    """The same items, with the progress reported once a second of the log."""
+    reported_ns = start_ns
+    for item in items:
+        if item.time_ns - reported_ns > 1_000_000_000:
+            stage.advance_to((item.time_ns - start_ns) * 1e-9)
+            reported_ns = item.time_ns
+        yield item
+
+
+def _counts(log: RobotLog, poses: int, scans: int, fused: int) -> dict[str, int]:
+    return {
+        "laser scanners": len(log.scanners),
+        "odometry poses": len(log.odometry),
+        "laser scans used": poses,
+        "audio scans": scans,
+        "audio scans fused": fused,
+    }
