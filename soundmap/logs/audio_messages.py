@@ -218,6 +218,8 @@ def _counted_audio(message: Any) -> AudioPacket:
     )
     header = message.header
     counter = int(message.seq_num) if hasattr(message, "seq_num") else None
+    if counter is not None and counter > 2**62:
+        raise MessageError("audio block claims an impossible count of samples")
     return AudioPacket(
         ros_stamp_ns(header.stamp),
         frame_name(header.frame_id),

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from soundmap.geometry import FloatArray, Trajectory, composed, inverted, relative, wrapped_angle
 from soundmap.logs.messages import ros_stamp_ns
+from soundmap.logs.stamps import increasing
 from soundmap.losses import LossLedger
 
 MIN_QUATERNION_NORM = 1e-3
@@ -118,14 +119,6 @@ def odometry_trajectory(
         pose = _bridged(time_ns, pose, sound, twist)
     source = "twist" if np.count_nonzero(by_twist) > np.count_nonzero(sound) else "pose"
     return Trajectory(time_ns, pose, np.ones(len(time_ns), dtype=bool)), source
-
-
-def increasing(time_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """True where a time is later than all before it, shape (K,)."""
-    latest = np.maximum.accumulate(time_ns) if len(time_ns) else time_ns
-    rising = np.ones(len(time_ns), dtype=bool)
-    rising[1:] = time_ns[1:] > latest[:-1]
-    return rising
 
 
 def _planar_poses(numbers: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import struct
-import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -24,18 +23,18 @@ from mcap.records import Channel as ChannelRecord
 from mcap.records import ChunkIndex, Footer, Schema
 
 from soundmap.errors import LogError
+from soundmap.logs.chunk import MAX_CHUNK_BYTES, chunk_content
 from soundmap.losses import LossLedger
 
 MAGIC = b"\x89MCAP0\r\n"
-MAX_CHUNK_BYTES = 256 * 2**20
-"""A chunk that claims to expand to more than this is taken for damaged: 33 kB can claim 1 GiB."""
-
 BATCH_BYTES = 2**20
 """Messages outside chunks are put in order in batches of this size."""
 
+LAST_TIME_NS = 2**62
+"""The year 2116; what was logged later was not."""
+
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
-_CHUNK = struct.Struct("<QQQI")
 _DAMAGE = (
     McapError, ValueError, struct.error, OSError, KeyError, RuntimeError, MemoryError, EOFError,
 )  # fmt: skip
@@ -225,7 +224,7 @@ class _FileWalk:
                 return None
             channel_id, _, log_time, publish_time = _MESSAGE.unpack_from(data)
             channel = self._selected(channel_id)
-            if channel is None:
+            if channel is None or not self._is_time(log_time):
                 return None
             return Message(channel, log_time, publish_time, data[_MESSAGE.size :])
         try:
@@ -238,6 +237,12 @@ class _FileWalk:
         except _DAMAGE:
             self.log.count("damaged schema or channel record", self.file.name, "left out")
         return None
+
+    def _is_time(self, log_time: int) -> bool:
+        if log_time <= LAST_TIME_NS:
+            return True
+        self.log.count("message logged at an impossible time", self.file.name, "left out")
+        return False
 
     def _add_channel(self, record: ChannelRecord) -> None:
         schema = self.schemas.get(record.schema_id) or self.summary.schemas.get(record.schema_id)
@@ -278,7 +283,7 @@ class _FileWalk:
             if length > MAX_CHUNK_BYTES:
                 raise ValueError(f"it is {length / 2**20:.0f} MiB long, more than is credible")
             # Checksums need no second look in later passes: a damaged chunk holds no topics.
-            data = _chunk_content(stream.read(length), check=held is None)
+            data = chunk_content(stream.read(length), check=held is None)
         except _DAMAGE as error:
             self.log.count("damaged chunk", self.file.name, f"left out ({_reason(error)})")
             self.log.remember_chunk(place, frozenset())
@@ -306,7 +311,7 @@ class _FileWalk:
             channel_id, _, log_time, publish_time = read_message(data, start)
             ids.add(channel_id)
             channel = self._selected(channel_id)
-            if channel is not None:
+            if channel is not None and self._is_time(log_time):
                 messages.append(
                     Message(channel, log_time, publish_time, data[start + 22 : position])
                 )
@@ -360,48 +365,6 @@ def _summary(stream: IO[bytes], size: int) -> _Summary:
         return _Summary()
     found.chunk_offsets.sort()
     return found
-
-
-def _chunk_content(record: bytes, *, check: bool) -> bytes | memoryview:
-    """Records of a chunk, decompressed, of the promised size and checksum."""
-    _, _, size, checksum = _CHUNK.unpack_from(record)
-    position = _CHUNK.size
-    (name_length,) = struct.unpack_from("<I", record, position)
-    position += 4
-    compression = record[position : position + name_length].decode()
-    position += name_length
-    (length,) = struct.unpack_from("<Q", record, position)
-    compressed = memoryview(record)[position + 8 : position + 8 + length]
-    if len(compressed) != length:
-        raise ValueError("it is cut short")
-    if size > MAX_CHUNK_BYTES:
-        raise ValueError(f"it claims {size / 2**20:.0f} MiB, more than is credible")
-    data = _decompressed(compressed, compression, size)
-    if len(data) != size:
-        raise ValueError(f"{size} bytes promised, {len(data)} found")
-    if check and checksum and zlib.crc32(data) != checksum:
-        raise ValueError("wrong checksum")
-    return data
-
-
-def _decompressed(data: memoryview, compression: str, size: int) -> bytes | memoryview:
-    if compression == "" or size == 0:
-        return data
-    if compression == "zstd":
-        import zstandard
-
-        try:
-            promised = zstandard.frame_content_size(data)
-            if promised not in (-1, size):
-                raise ValueError(f"{size} bytes promised, {promised} packed")
-            return zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
-        except zstandard.ZstdError as error:
-            raise ValueError(str(error)) from None
-    if compression == "lz4":
-        import lz4.frame
-
-        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size))
-    raise ValueError(f"compressed with {compression!r}, which is unknown here")
 
 
 def _reason(error: BaseException) -> str:

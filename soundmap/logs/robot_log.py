@@ -17,19 +17,18 @@ import numpy as np
 from soundmap.config import Config
 from soundmap.geometry import FloatArray, Mount, Trajectory
 from soundmap.logs.audio_messages import PACKET_READERS, block_samples
+from soundmap.logs.audio_stream import AudioStream, audio_stream, microphone_array
 from soundmap.logs.laser_messages import SWEEP_READERS, LaserSweep, valid_ranges
 from soundmap.logs.log_files import log_files
 from soundmap.logs.reader import McapLog
+from soundmap.logs.stamps import DAMAGED
 from soundmap.logs.streams import (
-    AudioStream,
     LaserStream,
-    audio_stream,
     base_mounts,
     laser_streams,
-    microphone_array,
     odometry_stream,
 )
-from soundmap.logs.survey import DAMAGED, Survey
+from soundmap.logs.survey import Survey
 from soundmap.losses import LossLedger
 from soundmap.sensors import AudioBlock, LaserScan, MicArray
 
@@ -207,9 +206,10 @@ def open_log(path: Path, config: Config, *, need_audio: bool = True) -> RobotLog
     survey = Survey(log, need_audio=need_audio)
     name = str(path)
     odometry = odometry_stream(survey, config, name, losses)
+    ahead_ns = odometry.ahead_ns
     mounts = base_mounts(survey, config, odometry, name, losses)
-    lasers = laser_streams(survey, config, mounts, name, losses)
-    audio = audio_stream(survey, config, name, losses) if need_audio else None
+    lasers = laser_streams(survey, config, mounts, ahead_ns, name, losses)
+    audio = audio_stream(survey, config, ahead_ns, name, losses) if need_audio else None
     array = microphone_array(config, audio, mounts, name) if audio else None
     return RobotLog(
         path=path,

@@ -6,34 +6,26 @@ from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from soundmap.config import Config
 from soundmap.errors import ConfigError, NothingUsableError
 from soundmap.geometry import Mount, Trajectory
-from soundmap.logs.audio_messages import (
-    STAMP_IS_START,
-    AudioEncoding,
-    AudioFormatError,
-    SampleFormat,
-)
 from soundmap.logs.messages import Kind
-from soundmap.logs.mounts import FrameTree, Mounts, nearest_names
-from soundmap.logs.odometry import OdometryRecord, increasing, odometry_trajectory
-from soundmap.logs.sample_clock import SampleClock, sample_clock
-from soundmap.logs.survey import DAMAGED, AudioRecord, LaserRecord, Survey, Topic
-from soundmap.logs.topics import audio_topic, laser_topics, nothing_of, odometry_topic
+from soundmap.logs.mounts import FrameTree, Mounts
+from soundmap.logs.odometry import OdometryRecord, odometry_trajectory
+from soundmap.logs.stamps import DAMAGED, Times, increasing, on_common_clock, stream_times
+from soundmap.logs.survey import AudioRecord, LaserRecord, Survey, Topic
+from soundmap.logs.topics import laser_topics, nothing_of, odometry_topic
 from soundmap.losses import LossLedger
-from soundmap.sensors import TILT_WARNING_RAD, MicArray
-
-Times = NDArray[np.int64]
+from soundmap.sensors import TILT_WARNING_RAD
 
 
 @dataclass(frozen=True)
 class OdometryStream:
     """The base in the odometry frame, and where that comes from.
 
-    ``source`` is "pose", "twist" or "transform".
+    ``source`` is "pose", "twist" or "transform"; ``ahead_ns`` how far the stamps are ahead of the
+    log's own time.
     """
 
     topic: str
@@ -41,6 +33,7 @@ class OdometryStream:
     source: str
     parent: str
     child: str
+    ahead_ns: int
 
 
 @dataclass(frozen=True)
@@ -67,30 +60,6 @@ class LaserStream:
     mounts: dict[str, Mount]
 
 
-@dataclass(frozen=True)
-class AudioStream:
-    """How to read the microphones.
-
-    Attributes
-    ----------
-    topic : Topic
-    encoding : AudioEncoding
-    sample : SampleFormat
-    message : ndarray of int, shape (B,)
-        Which messages of the topic are used.
-    clock : SampleClock
-        Of these messages.
-    stamp_is_start : bool
-    """
-
-    topic: Topic
-    encoding: AudioEncoding
-    sample: SampleFormat
-    message: NDArray[np.intp]
-    clock: SampleClock
-    stamp_is_start: bool
-
-
 def odometry_stream(
     survey: Survey, config: Config, log_name: str, losses: LossLedger
 ) -> OdometryStream:
@@ -108,16 +77,16 @@ def odometry_stream(
         if not isinstance(topic.record, OdometryRecord):
             raise NothingUsableError(f"{log_name}: {topic.name} cannot be read ({topic.problem}).")
         name, record = topic.name, topic.record
-    times = stamps_or_log_times(record.stamp_ns, record.log_time_ns, name, losses)
-    trajectory, source = odometry_trajectory(times, record.table(), name, losses)
+    times, ahead_ns = stream_times(record.stamp_ns, record.log_time_ns, name, losses)
+    whole = times != DAMAGED
+    trajectory, source = odometry_trajectory(times[whole], record.table()[whole], name, losses)
     if len(trajectory) < 2:
         raise NothingUsableError(
             f"{log_name}: no usable odometry on {name}: {len(record)} messages, "
             f"{len(trajectory)} of them sound. Check the robot's odometry."
         )
-    return OdometryStream(
-        name, trajectory, "transform" if topic is None else source, record.parent, record.child
-    )
+    source = "transform" if topic is None else source
+    return OdometryStream(name, trajectory, source, record.parent, record.child, ahead_ns)
 
 
 def _moving_transform(survey: Survey, config: Config, log_name: str) -> tuple[str, OdometryRecord]:
@@ -160,19 +129,6 @@ def _sensor_frames(survey: Survey) -> list[str]:
     return frames
 
 
-def stamps_or_log_times(stamps: object, log_times: object, topic: str, losses: LossLedger) -> Times:
-    """Header stamps, or the log's own time where no stamp was ever set; damaged ones stay."""
-    stamp, log_time = np.array(stamps, dtype=np.int64), np.array(log_times, dtype=np.int64)
-    unset = stamp == 0
-    losses.remark(
-        "message without a stamp",
-        topic,
-        count=int(np.count_nonzero(unset)),
-        effect="time of logging used instead",
-    )
-    return np.where(unset, log_time, stamp)
-
-
 def base_mounts(
     survey: Survey, config: Config, odometry: OdometryStream, log_name: str, losses: LossLedger
 ) -> Mounts:
@@ -197,9 +153,16 @@ def base_mounts(
 
 
 def laser_streams(
-    survey: Survey, config: Config, mounts: Mounts, log_name: str, losses: LossLedger
+    survey: Survey,
+    config: Config,
+    mounts: Mounts,
+    ahead_ns: int | None,
+    log_name: str,
+    losses: LossLedger,
 ) -> tuple[LaserStream, ...]:
     """How to read every scanner.
+
+    ``ahead_ns`` is how far the odometry's stamps are ahead of the log's time, if there are any.
 
     Raises
     ------
@@ -210,7 +173,7 @@ def laser_streams(
     """
     topics = laser_topics(survey, config, log_name)
     streams = [
-        _laser_stream(topic, mounts, log_name, losses)
+        _laser_stream(topic, mounts, ahead_ns, log_name, losses)
         for topic in topics
         if isinstance(topic.record, LaserRecord)
     ]
@@ -223,11 +186,15 @@ def laser_streams(
     return tuple(streams)
 
 
-def _laser_stream(topic: Topic, mounts: Mounts, log_name: str, losses: LossLedger) -> LaserStream:
+def _laser_stream(
+    topic: Topic, mounts: Mounts, ahead_ns: int | None, log_name: str, losses: LossLedger
+) -> LaserStream:
     record = topic.record
     if not isinstance(record, LaserRecord):
         raise NothingUsableError(f"{log_name}: {topic.name} cannot be read ({topic.problem}).")
-    times = stamps_or_log_times(record.stamp_ns, record.log_time_ns, topic.name, losses)
+    times, own_ahead_ns = stream_times(record.stamp_ns, record.log_time_ns, topic.name, losses)
+    if ahead_ns is not None:
+        times = on_common_clock(times, own_ahead_ns, ahead_ns, topic.name, losses)
     sound = np.flatnonzero(times != DAMAGED)
     rising = increasing(times[sound])
     losses.add(
@@ -269,183 +236,3 @@ def _ray_interval_is_sound(record: LaserRecord, times: Times, losses: LossLedger
         effect="all its rays are used at the time of the first",
     )
     return False
-
-
-def audio_stream(survey: Survey, config: Config, log_name: str, losses: LossLedger) -> AudioStream:
-    """How to read the microphones.
-
-    Raises
-    ------
-    ConfigError
-        The topic is not settled, or does not fit the array.
-    NothingUsableError
-        There is no audio, or none that can be read.
-    """
-    topic = audio_topic(survey, config, log_name)
-    record = topic.record
-    if not isinstance(record, AudioRecord):
-        raise NothingUsableError(f"{log_name}: {topic.name} cannot be read ({topic.problem}).")
-    encoding, sample = _audio_encoding(survey, topic, record, log_name)
-    kept, frames = _whole_blocks(record, encoding, sample, topic.name, losses)
-    if not len(kept):
-        raise NothingUsableError(
-            f"{log_name}: no usable audio on {topic.name}: none of {topic.messages} messages is "
-            "sound."
-        )
-    stamps = stamps_or_log_times(record.stamp_ns, record.log_time_ns, topic.name, losses)[kept]
-    setting = config.audio.stamp
-    is_start = STAMP_IS_START[record.form] if setting == "auto" else setting == "start"
-    counter = np.array(record.first_frame, dtype=np.int64)[kept]
-    clock = sample_clock(
-        stamps,
-        frames,
-        encoding.rate_hz,
-        stamp_is_start=is_start,
-        first_frame=None if np.any(counter < 0) else counter,
-    )
-    _count_clock_losses(clock, topic.name, losses)
-    return AudioStream(topic, encoding, sample, kept, clock, is_start)
-
-
-def _count_clock_losses(clock: SampleClock, topic: str, losses: LossLedger) -> None:
-    losses.add(
-        "audio block repeats or overlaps the one before",
-        topic,
-        count=int(np.count_nonzero(~clock.kept)),
-        effect="left out",
-    )
-    losses.add(
-        "gap in the audio",
-        topic,
-        count=clock.gaps,
-        effect=f"{clock.lost_s:.2f} s missing; nothing is joined over it",
-    )
-    if abs(clock.drift_ppm) > 2000.0:
-        losses.remark(
-            f"the sample rate by the stamps is {clock.rate_hz:.0f} Hz, not the recorder's",
-            topic,
-            effect="times follow the stamps",
-        )
-
-
-def _audio_encoding(
-    survey: Survey, topic: Topic, record: AudioRecord, log_name: str
-) -> tuple[AudioEncoding, SampleFormat]:
-    """The encoding of most messages; that of an audio info where messages do not tell."""
-    votes = Counter(index for index in record.encoding if index >= 0)
-    if not votes:
-        raise NothingUsableError(
-            f"{log_name}: no usable audio on {topic.name}: all {topic.messages} messages are "
-            "damaged."
-        )
-    encoding = record.encodings[votes.most_common(1)[0][0]]
-    if encoding is None:
-        infos = [t for t in survey.of_kind(Kind.AUDIO_INFO) if t.info is not None or t.problem]
-        if not infos:
-            raise NothingUsableError(
-                f"{log_name}: {topic.name} does not tell rate and channels, and the log has no "
-                "audio info message (it is sent once, when the driver starts). Start the recording "
-                "before the driver."
-            )
-        name = topic.name
-        info = max(infos, key=lambda t: (_common_prefix(t.name, name), t.name))
-        if info.info is None:
-            raise NothingUsableError(f"{log_name}: {info.name}: {info.problem}.")
-        encoding = info.info
-    try:
-        return encoding, encoding.sample_format()
-    except AudioFormatError as error:
-        raise NothingUsableError(f"{log_name}: topic {topic.name}: {error}.") from None
-
-
-def _common_prefix(first: str, second: str) -> int:
-    length = 0
-    for a, b in zip(first, second, strict=False):
-        if a != b:
-            break
-        length += 1
-    return length
-
-
-def _whole_blocks(
-    record: AudioRecord,
-    encoding: AudioEncoding,
-    sample: SampleFormat,
-    topic: str,
-    losses: LossLedger,
-) -> tuple[NDArray[np.intp], Times]:
-    """Messages of the chosen encoding whose length is as declared, and their lengths."""
-    index = np.array(record.encoding, dtype=np.int64)
-    chosen = [i for i, e in enumerate(record.encodings) if e is None or e == encoding]
-    usable = np.isin(index, chosen)
-    losses.add(
-        "audio block in another format than most",
-        topic,
-        count=int(np.count_nonzero(~usable & (index >= 0))),
-        effect="left out",
-    )
-    size = np.array(record.size, dtype=np.int64)
-    frames, rest = np.divmod(size, encoding.channels * sample.width)
-    declared = np.array(record.declared_frames, dtype=np.int64)
-    whole = (rest == 0) & (frames > 0) & ((declared <= 0) | (declared == frames))
-    losses.add(
-        "audio block is not as long as its header says",
-        topic,
-        count=int(np.count_nonzero(usable & ~whole)),
-        effect="left out",
-    )
-    kept = np.flatnonzero(usable & whole)
-    return kept, frames[kept]
-
-
-def microphone_array(
-    config: Config, stream: AudioStream, mounts: Mounts, log_name: str
-) -> MicArray:
-    """The microphones where the configuration and the log put them.
-
-    Raises
-    ------
-    ConfigError
-        Channels and microphones differ in number, or the mount is unknown.
-    """
-    positions = config.array.microphone_positions()
-    if len(positions) != stream.encoding.channels:
-        raise ConfigError(
-            f"{log_name}: topic {stream.topic.name} has {stream.encoding.channels} channels, the "
-            f"array in the configuration has {len(positions)} microphones. Choose the topic with "
-            '[topics] audio = "...", or give the matching robot file with --config.'
-        )
-    return MicArray(
-        positions,
-        _array_mount(config, stream, mounts, log_name),
-        config.array.pascal_per_count,
-    )
-
-
-def _array_mount(config: Config, stream: AudioStream, mounts: Mounts, log_name: str) -> Mount:
-    if config.array.mount is not None:
-        return Mount.planar(*config.array.mount)
-    advice = "Set [array] frame, or [array] mount = [x, y, z, yaw_rad]."
-    if config.array.frame is not None:
-        frame = config.array.frame.removeprefix("/")
-        found = mounts.get(frame)
-        if found is None:
-            near = nearest_names(frame, mounts.tree.frames)
-            hint = f" Did you mean {near}?" if near else ""
-            raise ConfigError(
-                f"{log_name}: [array] frame = {frame!r} is not in the log. Frames known: "
-                f"{', '.join(mounts.tree.frames) or 'none'}.{hint} {advice}"
-            )
-        return found
-    record = stream.topic.record
-    own = record.frame_ids.most_common(1)[0][0] if isinstance(record, AudioRecord) else ""
-    for frame in (own, "mic_array"):
-        found = mounts.get(frame) if frame else None
-        if found is not None:
-            return found
-    known = ", ".join(mounts.tree.frames) or "none"
-    told = f"its audio names {own!r}" if own else "its audio names no frame"
-    raise ConfigError(
-        f"{log_name}: where the microphone array is mounted is unknown: {told}, and there is no "
-        f"'mic_array'. Frames known: {known}. {advice}"
-    )

@@ -12,21 +12,20 @@ import numpy as np
 from soundmap.config import Config
 from soundmap.errors import SoundmapError
 from soundmap.geometry import Mount, wrapped_angle
+from soundmap.logs.audio_stream import AudioStream, audio_stream, microphone_array
 from soundmap.logs.log_files import log_files
 from soundmap.logs.messages import Kind
 from soundmap.logs.mounts import FrameTree, Mounts
 from soundmap.logs.reader import McapLog
+from soundmap.logs.stamps import DAMAGED
 from soundmap.logs.streams import (
-    AudioStream,
     LaserStream,
     OdometryStream,
-    audio_stream,
     base_mounts,
     laser_streams,
-    microphone_array,
     odometry_stream,
 )
-from soundmap.logs.survey import DAMAGED, Survey
+from soundmap.logs.survey import Survey
 from soundmap.losses import Loss, LossLedger
 
 Found = TypeVar("Found")
@@ -150,13 +149,14 @@ def log_summary(path: Path, config: Config) -> LogSummary:
             return None
 
     odometry = attempted(lambda: odometry_stream(survey, config, name, losses))
+    ahead_ns = odometry.ahead_ns if odometry else None
     mounts = (
         base_mounts(survey, config, odometry, name, losses)
         if odometry
         else _mounts_without_odometry(survey, config, name)
     )
-    lasers = attempted(lambda: laser_streams(survey, config, mounts, name, losses)) or ()
-    audio = attempted(lambda: audio_stream(survey, config, name, losses))
+    lasers = attempted(lambda: laser_streams(survey, config, mounts, ahead_ns, name, losses)) or ()
+    audio = attempted(lambda: audio_stream(survey, config, ahead_ns, name, losses))
     if audio is not None:
         stream = audio
         attempted(lambda: microphone_array(config, stream, mounts, name))

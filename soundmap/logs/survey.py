@@ -25,11 +25,9 @@ from soundmap.logs.messages import KINDS, Form, Kind, form_of
 from soundmap.logs.odometry import OdometryRecord
 from soundmap.logs.reader import Channel, McapLog, Message
 from soundmap.logs.schemas import Decoder, MessageError, MessageType, SchemaError, message_type
+from soundmap.logs.stamps import DAMAGED
 from soundmap.logs.transforms import TRANSFORM_READERS, TransformRecord
 from soundmap.losses import LossLedger
-
-DAMAGED = -(2**62)
-"""Stands for the stamp of a message that cannot be used."""
 
 _ATTRIBUTE_FAULTS = (MessageError, AttributeError, TypeError, ValueError, OverflowError, IndexError)
 

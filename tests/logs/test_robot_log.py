@@ -557,6 +557,32 @@ def test_messages_without_stamps_get_the_time_of_logging(log_path):
     assert not log.losses.data_lost
 
 
+def test_one_stamp_in_the_far_future_costs_one_message(log_path):
+    def change(i, message):
+        if i == 30:
+            message["header"]["stamp"] = time_of(START_NS + 10**6 * SECOND)
+        return message
+
+    log = opened(log_path, static, lambda w: drive(w, change=change), scans, frames)
+    assert what(log) == {"stamp far from the time of logging": 1}
+    assert len(log.odometry) == 100
+
+
+def test_sensors_on_another_clock_are_brought_together_by_the_time_of_logging(log_path):
+    behind = 3600 * SECOND
+
+    def late_scans(log):
+        for i in range(20):
+            time = START_NS + i * SECOND // 10
+            message = laser_scan(time - behind, "laser", RANGES)
+            log.ros2("/scan", "sensor_msgs/msg/LaserScan", message, time)
+
+    log = opened(log_path, static, drive, late_scans, frames)
+    assert [s.time_ns for s in log.lasers()] == [START_NS + i * SECOND // 10 for i in range(20)]
+    assert [loss.what for loss in log.losses] == ["stamps are -3600.0 s off those of the odometry"]
+    assert not log.losses.data_lost
+
+
 def test_odometry_comes_from_the_transform_under_the_sensors_when_there_is_no_topic(log_path):
     def moving(log):
         for i in range(101):
