@@ -183,8 +183,9 @@ class Array(Table):
     gain_error_db: NotNegative = 0.0
     """Standard deviation of each microphone's gain."""
     self_noise_dba: float = 28.0
-    pascal_per_count: Positive = 3e-4
-    """Sound pressure of one step of the analogue-to-digital converter [Pa]."""
+    pascal_per_count: Positive = 8.61e-4
+    """Sound pressure of one step of the analogue-to-digital converter [Pa]. The default is that
+    of a 16 bit digital microphone of -26 dB full scale at 94 dB."""
 
     def nominal_positions(self) -> FloatArray:
         """Positions in the array's frame, shape (Q, 3) [m]."""
