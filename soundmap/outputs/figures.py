@@ -94,7 +94,6 @@ def power_ratio_figure(ratio: PowerRatio, *, room: OccupancyGrid | None, title: 
     finite = np.abs(level[np.isfinite(level)])
     reach = float(np.clip(finite.max(initial=0.0), LEAST_RATIO_DB, GREATEST_RATIO_DB))
     part, extent = cropped(level, ratio.frame, area)
-    faint, _ = cropped(np.where(ratio.background_measured, 1.0, 0.5), ratio.frame, area)
     image = axes.imshow(
         np.clip(part.astype(np.float64), -reach, reach),
         origin="lower",
@@ -102,7 +101,6 @@ def power_ratio_figure(ratio: PowerRatio, *, room: OccupancyGrid | None, title: 
         cmap="RdBu_r",
         vmin=-reach,
         vmax=reach,
-        alpha=faint.astype(np.float64),
         interpolation="nearest",
     )
     if np.isnan(level).all():
@@ -110,8 +108,16 @@ def power_ratio_figure(ratio: PowerRatio, *, room: OccupancyGrid | None, title: 
     else:
         bar = figure.colorbar(image, cax=axes.inset_axes(BESIDE), extend=_open_ends(level, reach))
         bar.set_label("power of the run over that of the background [dB]")
-        if np.any(np.isfinite(level) & ~ratio.background_measured):
-            axes.set_xlabel("x [m]\npale: not measured in the background, whose median stands in")
+    without = np.argwhere(np.isfinite(level) & ~ratio.background_measured)
+    if len(without):
+        axes.plot(
+            *ratio.frame.centres(without).T,
+            linestyle="none",
+            marker=".",
+            markersize=2.0,
+            color="black",
+            label="not measured in the background: against its median",
+        )
     if room is not None:
         draw_wall_outlines(axes, room, area)
     draw_places(axes, places, area)

@@ -88,7 +88,17 @@ def test_the_colours_of_a_ratio_are_centred_on_no_difference():
     assert low == -high
     assert high == 20.0
     assert {"S1", "S2"} <= texts(figure)
-    assert "median" in figure.axes[0].get_xlabel()
+
+
+def test_cells_without_a_background_of_their_own_are_marked():
+    ratio = made_ratio()
+    figure = power_ratio_figure(ratio, room=None, title="run1 against run3")
+    (marks,) = (line for line in figure.axes[0].lines if "median" in str(line.get_label()))
+    without = np.isfinite(ratio.ratio_db) & ~ratio.background_measured
+    np.testing.assert_array_equal(ratio.frame.cells(marks.get_xydata()), np.argwhere(without))
+    complete = replace(ratio, background_measured=np.ones_like(ratio.background_measured))
+    figure = power_ratio_figure(complete, room=None, title="run1 against run3")
+    assert not [line for line in figure.axes[0].lines if "median" in str(line.get_label())]
 
 
 def test_a_small_ratio_is_not_blown_up_to_full_colours():
