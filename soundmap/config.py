@@ -95,15 +95,15 @@ class LocalizeConfig(Table):
 
     seed: Annotated[int, Field(ge=0)] = 1
     """Seed of the random numbers: the same log gives the same trajectory."""
-    particles: Count = 500
+    particles: Count = 300
     """:math:`M`, particles while tracking."""
-    global_particles: Count = 5000
+    global_particles: Count = 3000
     """Particles while the start is being sought."""
     beams: Count = 60
     """Rays used of each laser scan, spread evenly over its valid ones."""
-    update_distance_m: NotNegative = 0.05
+    update_distance_m: NotNegative = 0.10
     """A laser scan is used once the robot has moved this far ..."""
-    update_angle_rad: NotNegative = math.radians(2.0)
+    update_angle_rad: NotNegative = math.radians(4.0)
     """... or turned this far [rad] ..."""
     update_interval_s: Positive = 0.5
     """... or this much time has passed, whichever is first [s]."""

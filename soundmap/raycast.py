@@ -9,7 +9,7 @@ bias towards the robot would be left if the near boundary were taken.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from soundmap.geometry import FloatArray
@@ -93,7 +93,7 @@ def walked_range(
     return limit
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _cast_many(
     occupied: NDArray[np.bool_],
     points: FloatArray,
@@ -103,7 +103,7 @@ def _cast_many(
     range_max: float,
 ) -> FloatArray:
     ranges = np.empty(len(bearings))
-    for ray in prange(len(bearings)):
+    for ray in range(len(bearings)):
         x = (points[ray, 0] - origin[0]) / resolution
         y = (points[ray, 1] - origin[1]) / resolution
         cos, sin = np.cos(bearings[ray]), np.sin(bearings[ray])

@@ -15,7 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 from soundmap.deskew import Rays
@@ -138,7 +138,7 @@ def _near_occupied(room: OccupancyGrid, points: FloatArray) -> NDArray[np.bool_]
     return np.any(inside & room.occupied[row, column], axis=1)
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _log_likelihood(
     occupied: NDArray[np.bool_],
     grid_origin: FloatArray,
@@ -153,7 +153,7 @@ def _log_likelihood(
     hit_scale = hit_weight / (np.sqrt(2.0 * np.pi) * sigma)
     random = random_weight / range_max
     result = np.empty(len(pose))
-    for particle in prange(len(pose)):
+    for particle in range(len(pose)):
         x, y, heading = pose[particle]
         cos, sin = np.cos(heading), np.sin(heading)
         total = 0.0

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from soundmap.geometry import FloatArray, wrapped_angle
 
+ROUGHENING = np.array([0.003, 0.003, np.radians(0.1)])
+"""How far apart the copies of a particle are set [m, m, rad]."""
 MODE_RADIUS_M = 0.5
 MODE_RADIUS_RAD = np.radians(30.0)
 """Particles farther than this from a mode belong to another hypothesis."""
@@ -76,11 +78,15 @@ def reweighted(particles: Particles, log_likelihood: FloatArray) -> Particles:
 
 
 def resampled(particles: Particles, count: int, rng: np.random.Generator) -> Particles:
-    """``count`` particles drawn in proportion to their weights, by systematic resampling."""
+    """``count`` particles drawn in proportion to their weights, by systematic resampling.
+
+    Copies of one particle are set a little apart, or a robot at rest would run out of candidates.
+    """
     position = (rng.random() + np.arange(count)) / count
     edges = np.cumsum(particles.weight)
     chosen = np.searchsorted(edges, position * edges[-1], side="right")
-    return equally_weighted(particles.pose[np.minimum(chosen, len(particles) - 1)])
+    pose = particles.pose[np.minimum(chosen, len(particles) - 1)]
+    return equally_weighted(pose + ROUGHENING * rng.standard_normal(pose.shape))
 
 
 def estimated_pose(particles: Particles) -> PoseEstimate:

@@ -44,8 +44,9 @@ def test_systematic_resampling_keeps_each_particle_about_its_weight_times():
     pose = np.zeros((100, 3))
     pose[:, 0] = np.arange(100)
     drawn = resampled(Particles(pose, weight), 1000, rng)
-    counts = np.bincount(drawn.pose[:, 0].astype(int), minlength=100)
+    counts = np.bincount(np.rint(drawn.pose[:, 0]).astype(int), minlength=100)
     assert np.all(np.abs(counts - 1000 * weight) < 1.0)
+    assert 0 < np.abs(drawn.pose - np.rint(drawn.pose)).max() < 0.03, "copies are set apart"
     assert drawn.weight == pytest.approx(np.full(1000, 1e-3))
 
 

@@ -158,6 +158,14 @@ class TestFaults:
         estimate = estimate_trajectory(still, stuck, ROOM, CONFIG, start_pose=START)
         assert errors(estimate)[0].max() < 0.08
 
+    def test_a_log_of_a_robot_at_rest_is_localized_without_a_start_pose(self):
+        rest = worlds.driven([(1.0, 1.0), (1.0, 1.0), (1.0, 1.0)])
+        rest = Trajectory(rest.time_ns, np.repeat(rest.pose[:1], len(rest), axis=0), rest.usable)
+        scans = worlds.laser_scans(rest, [worlds.FRONT, worlds.BACK])
+        estimate = estimate_trajectory(scans, odometry_of(rest), ROOM, CONFIG)
+        assert estimate.usable.mean() > 0.9
+        assert errors(estimate, rest)[0][estimate.usable].max() < 0.08
+
     def test_scans_without_returns(self):
         empty = [replace(scan, range_m=np.full_like(scan.range_m, np.nan)) for scan in SCANS]
         losses = LossLedger()
