@@ -135,6 +135,8 @@ def _ros_definitions(channel: Channel, name: str) -> dict[str, Any]:
         return {}
     try:
         if channel.schema_encoding == "ros2idl":
+            # The parser knows no preprocessor; what is included is in the text as well.
+            text = "\n".join(line for line in text.splitlines() if not line.startswith("#"))
             # rosbag2 separates the files by a line of = signs and a line "IDL: pkg/msg/Type".
             parts = [part.partition("\n")[2] for part in ("\n" + text).split("=" * 80)]
             bodies = [p.partition("\n")[2] if p.startswith("IDL:") else p for p in parts]
