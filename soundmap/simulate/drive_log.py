@@ -111,7 +111,9 @@ def odometry_messages(
     """Odometry and, if published, the transforms that say the same; in order of arrival."""
     odometry, base = drive.scene.odometry, drive.scene.robot.base_frame
     clock, interval = odometry.clock, 1.0 / odometry.rate_hz
-    times = measurement_times(drive.motion.duration_s, interval, drift_ppm=clock.drift_ppm)
+    # The last message ends the log: every sweep lies between two.
+    end_s = drive.motion.duration_s + 2.0 * interval
+    times = measurement_times(end_s, interval, drift_ppm=clock.drift_ppm)
     poses, twists = wheel_odometry(
         drive.motion.at(times),
         interval,

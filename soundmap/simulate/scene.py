@@ -237,8 +237,8 @@ class Laser(Table):
     """... and its growth with the distance."""
     dropout_share: Share = 0.003
     """Rays that do not come back."""
-    phase_s: NotNegative = 0.0
-    """When the first sweep begins."""
+    phase_s: NotNegative = 0.01
+    """When the first sweep begins; the odometry begins at 0."""
     clock: Clock = Clock()
 
 
@@ -303,7 +303,7 @@ class Scene(Table):
             topic="/scan_back",
             frame="laser_back",
             mount=(-0.22, 0.0, 0.3, math.pi),
-            phase_s=0.007,
+            phase_s=0.017,
         ),
     )
     odometry: Odometry = Odometry()
