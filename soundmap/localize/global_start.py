@@ -49,13 +49,15 @@ def start_hypotheses(room: OccupancyGrid, rays: Rays) -> tuple[FloatArray, Float
     if len(places) == 0 or len(rays) == 0:
         return np.empty((0, 3)), np.empty(0)
     heading = np.linspace(-np.pi, np.pi, COARSE_HEADINGS, endpoint=False)
-    grid = (distance, np.array(room.frame.origin_m), room.frame.resolution_m)
-    coarse = _place_scores(*grid, places, heading, rays.end_m, COARSE_SIGMA_M)
+    place_of = (np.array(room.frame.origin_m), room.frame.resolution_m)
+    blurred = _nearness_to_wall(distance, COARSE_SIGMA_M)
+    coarse = _place_scores(blurred, *place_of, places, heading, rays.end_m)
     best = np.argsort(coarse, axis=None)[::-1][:CANDIDATES]
     place, turn = np.unravel_index(best, coarse.shape)
     pose = np.column_stack([places[place], heading[turn]])
+    sharper = _nearness_to_wall(distance, FINE_SIGMA_M)
     for step_m in (0.1, 0.05, 0.025):
-        pose, score = _climbed(grid, pose, rays.end_m, step_m)
+        pose, score = _climbed((sharper, *place_of), pose, rays.end_m, step_m)
     return _separate_modes(pose, score)
 
 
@@ -64,6 +66,11 @@ def _distance_to_wall(room: OccupancyGrid) -> NDArray[np.float32]:
 
     distance = distance_transform_edt(~room.occupied) * room.frame.resolution_m
     return np.asarray(distance, dtype=np.float32)
+
+
+def _nearness_to_wall(distance: NDArray[np.float32], sigma_m: float) -> NDArray[np.float32]:
+    """1 on a wall, falling as a Gaussian of width ``sigma_m`` away from it."""
+    return np.exp(-0.5 * (distance / np.float32(sigma_m)) ** 2)
 
 
 def _places(room: OccupancyGrid, distance: NDArray[np.float32]) -> FloatArray:
@@ -90,7 +97,7 @@ def _climbed(
     # At 3 m, a usual range, a turn of step / 3 m moves the end points as far as a step does.
     offset = steps * np.array([step_m, step_m, step_m / 3.0])
     around = (pose[:, None, :] + offset).reshape(-1, 3)
-    score = _pose_scores(*grid, around, points, FINE_SIGMA_M).reshape(len(pose), -1)
+    score = _pose_scores(*grid, around, points).reshape(len(pose), -1)
     best = np.argmax(score, axis=1)
     chosen = around.reshape(len(pose), -1, 3)[np.arange(len(pose)), best]
     chosen[:, 2] = wrapped_angle(chosen[:, 2])
@@ -112,65 +119,55 @@ def _separate_modes(pose: FloatArray, score: FloatArray) -> tuple[FloatArray, Fl
 
 
 @njit(cache=True, nogil=True)
-def _nearness(
-    distance: NDArray[np.float32],
+def _score(
+    nearness: NDArray[np.float32],
     origin: FloatArray,
     resolution: float,
     x: float,
     y: float,
     heading: float,
     points: FloatArray,
-    sigma: float,
 ) -> float:
-    """Mean over the points of exp(-d^2 / 2 sigma^2), d the distance to the nearest wall."""
-    rows, columns = distance.shape
-    cos, sin = np.cos(heading), np.sin(heading)
-    factor = -0.5 / (sigma * sigma)
+    """Mean nearness to a wall of the points, seen from one pose."""
+    rows, columns = nearness.shape
+    cos, sin = np.cos(heading) / resolution, np.sin(heading) / resolution
+    start_x, start_y = (x - origin[0]) / resolution, (y - origin[1]) / resolution
     total = 0.0
     for point in range(len(points)):
-        column = int(
-            np.floor((x + cos * points[point, 0] - sin * points[point, 1] - origin[0]) / resolution)
-        )
-        row = int(
-            np.floor((y + sin * points[point, 0] + cos * points[point, 1] - origin[1]) / resolution)
-        )
-        if 0 <= row < rows and 0 <= column < columns:
-            d = distance[row, column]
-            total += np.exp(factor * d * d)
+        column = start_x + cos * points[point, 0] - sin * points[point, 1]
+        row = start_y + sin * points[point, 0] + cos * points[point, 1]
+        if 0.0 <= row < rows and 0.0 <= column < columns:
+            total += nearness[int(row), int(column)]
     return total / len(points)
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def _place_scores(
-    distance: NDArray[np.float32],
+    nearness: NDArray[np.float32],
     origin: FloatArray,
     resolution: float,
     places: FloatArray,
     heading: FloatArray,
     points: FloatArray,
-    sigma: float,
 ) -> FloatArray:
     score = np.empty((len(places), len(heading)))
     for place in prange(len(places)):
         x, y = places[place]
         for turn in range(len(heading)):
-            score[place, turn] = _nearness(
-                distance, origin, resolution, x, y, heading[turn], points, sigma
-            )
+            score[place, turn] = _score(nearness, origin, resolution, x, y, heading[turn], points)
     return score
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def _pose_scores(
-    distance: NDArray[np.float32],
+    nearness: NDArray[np.float32],
     origin: FloatArray,
     resolution: float,
     pose: FloatArray,
     points: FloatArray,
-    sigma: float,
 ) -> FloatArray:
     score = np.empty(len(pose))
     for index in prange(len(pose)):
         x, y, heading = pose[index]
-        score[index] = _nearness(distance, origin, resolution, x, y, heading, points, sigma)
+        score[index] = _score(nearness, origin, resolution, x, y, heading, points)
     return score
