@@ -243,6 +243,76 @@ def diff(
         _print({**report, "folder": str(folder)}, diff_view, as_json=as_json)
 
 
+@app.command()
+def evaluate(
+    run: Annotated[
+        Path, typer.Argument(metavar="RUN", help="Folder that process or diff has written.")
+    ],
+    sources: Annotated[
+        Path,
+        typer.Option(
+            metavar="TRUTH.csv", help="Where the sources truly are: columns id,x_m,y_m, and more."
+        ),
+    ],
+    trajectory: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="TRUTH.tum",
+            help="Where the robot truly was, in the frame of the same map, in TUM format.",
+        ),
+    ] = None,
+    *,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare a run with the truth, as in the paper's Table 2.
+
+    A source counts as detected when something was found within 0.5 m of it.
+    """
+    from soundmap.evaluate import evaluation, evaluation_view
+
+    result = evaluation(run, sources, trajectory)
+    _print(result.as_dict(), lambda _: evaluation_view(result), as_json=as_json)
+
+
+@app.command()
+def simulate(
+    scene: Annotated[
+        Path, typer.Argument(metavar="SCENE.toml", help="Room, sources, robot and route.")
+    ],
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", help="Folder for the log, its map and its truth.")
+    ],
+    run: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Which of the scene's runs. Default: the first."),
+    ] = None,
+    *,
+    force: Annotated[
+        bool,
+        typer.Option(
+            "--force",
+            help="Write into a folder that is not empty; files of the same names are replaced.",
+        ),
+    ] = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Simulate the log of a drive past noise sources, with its truth.
+
+    Writes an MCAP log, the geometric map, the true sources and trajectory, and robot.toml, which
+    process takes as --config.
+    """
+    from soundmap.outputs.progress import chosen_progress
+    from soundmap.simulate.simulation import simulated_run
+
+    with chosen_progress(quiet=quiet).stage("simulate", total=1.0) as stage:
+        done = simulated_run(scene, out, run=run, force=force, progress=stage.advance_to)
+    if not quiet:
+        sounding = ", ".join(done.sources) or "none"
+        print(f"{done.log}: {done.duration_s:.1f} s, sources that sound: {sounding}")
+        print(f"soundmap process {done.log} --map {out / 'map.yaml'}", end=" ")
+        print(f"--config {out / 'robot.toml'}")
+
+
 def main() -> None:
     """Entry point of the ``soundmap`` command."""
     signal.signal(signal.SIGTERM, _stop)

@@ -292,7 +292,7 @@ def read_tum(path: Path) -> Trajectory:
     number = 0
     try:
         for line in path.read_text(encoding="utf-8").splitlines():
-            number += 1  # noqa: SIM113 - told in the message if the line is no pose
+            number += 1
             words = line.split()
             if not words or words[0].startswith("#"):
                 continue

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import math
+import secrets
+import shutil
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -87,28 +91,42 @@ def simulated_run(
     """
     scene = loaded_scene(scene_file)
     drive, chosen = drive_of(scene, run)
-    out_dir.mkdir(parents=True, exist_ok=True) if not out_dir.is_file() else None
-    if out_dir.is_file() or (any(out_dir.iterdir()) and not force):
-        raise OutputError(f"{out_dir}: is not an empty folder. Choose another, or pass --force.")
-    log = out_dir / f"{chosen.name}.mcap"
     texts: dict[str, bytes] = {
         **map_files(drawn_map(scene)),
         "sources.csv": sources_csv(scene, drive.active, scene_file.parent).encode(),
         "trajectory.tum": trajectory_tum(drive).encode(),
         "robot.toml": robot_toml(scene).encode(),
     }
-    unfinished = out_dir / f".{log.name}.part"
+    name = f"{chosen.name}.mcap"
+    with _filled_folder(out_dir, force=force) as new:
+        topics = _topics(drive, chosen.name, scene_file.parent, progress)
+        messages = write_log(new / name, topics)
+        for each, content in texts.items():
+            (new / each).write_bytes(content)
+    log = out_dir / name
+    files = (log, *(out_dir / name for name in texts))
+    return SimulatedRun(chosen.name, log, files, drive.motion.duration_s, messages, drive.active)
+
+
+@contextmanager
+def _filled_folder(out_dir: Path, *, force: bool) -> Iterator[Path]:
+    """A hidden folder whose files move to ``out_dir`` when the ``with`` block ends well.
+
+    Other files of ``out_dir`` stay: ``force`` adds to a folder, it does not empty it.
+    """
+    if out_dir.is_file() or (out_dir.is_dir() and any(out_dir.iterdir()) and not force):
+        raise OutputError(f"{out_dir}: is not an empty folder. Choose another, or pass --force.")
+    new = out_dir.with_name(f".{out_dir.resolve().name}.partial-{secrets.token_hex(4)}")
     try:
-        messages = write_log(unfinished, _topics(drive, chosen.name, scene_file.parent, progress))
-        unfinished.replace(log)
-        for name, content in texts.items():
-            (out_dir / name).write_bytes(content)
+        new.mkdir(parents=True)
+        yield new
+        out_dir.mkdir(exist_ok=True)
+        for file in sorted(new.iterdir()):
+            file.replace(out_dir / file.name)
     except OSError as error:
         raise OutputError(f"{out_dir}: cannot be written ({error.strerror}).") from None
     finally:
-        unfinished.unlink(missing_ok=True)
-    files = (log, *(out_dir / name for name in texts))
-    return SimulatedRun(chosen.name, log, files, drive.motion.duration_s, messages, drive.active)
+        shutil.rmtree(new, ignore_errors=True)
 
 
 def drive_of(scene: Scene, run: str | None = None) -> tuple[Drive, Run]:
