@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 MATCH_M = 0.5
 """A source counts as detected when something was found within this distance."""
+SHOWN_NAMES = 8
 
 
 @dataclass(frozen=True)
@@ -223,7 +224,7 @@ def evaluation_view(result: Evaluation) -> RenderableType:
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for heading in ("Run", "Active sources", "Detected sources"):
         table.add_column(heading)
-    table.add_column("Error [m]", justify="right")
+    table.add_column("Error (m)", justify="right")
     for number, match in enumerate(result.matches):
         error = "" if match.error_m is None else f"{match.error_m:.3f}"
         run = result.run if number == 0 else ""
@@ -234,7 +235,10 @@ def evaluation_view(result: Evaluation) -> RenderableType:
     if errors := result.errors_m:
         mean = sum(errors) / len(errors)
         lines.append(f"Error         mean {mean:.3f} m, greatest {max(errors):.3f} m")
-    names = f" ({', '.join(result.false_alarms)})" if result.false_alarms else ""
+    names = ", ".join(result.false_alarms[:SHOWN_NAMES])
+    if len(result.false_alarms) > SHOWN_NAMES:
+        names += ", ..."
+    names = f" ({names})" if names else ""
     lines.append(f"False alarms  {len(result.false_alarms)}{names}")
     if (way := result.trajectory) is not None:
         lines.append(

@@ -77,6 +77,7 @@ def test_the_table_reads_as_the_papers(run: Path) -> None:
             evaluation_view(evaluation(run, run.parent / "truth.csv", run.parent / "truth.tum"))
         )
     words = [line.split() for line in captured.get().splitlines()]
+    assert ["Run", "Active", "sources", "Detected", "sources", "Error", "(m)"] in words
     assert ["run1", "S1", "S1", "0.050"] in words
     assert ["S3", "missed"] in words
     assert ["False", "alarms", "1", "(S3)"] in words
