@@ -7,20 +7,25 @@ import math
 import signal
 import sys
 from collections import Counter
-from collections.abc import Callable, Mapping
 from pathlib import Path
-from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
-from soundmap import __version__
+from soundmap import __version__, cli_runs
 from soundmap.errors import DataLossError, SoundmapError
+from soundmap.terminal import (
+    ConfigOption,
+    ForceOption,
+    JsonOption,
+    QuietOption,
+    print_result,
+    resolved_config,
+    show_error,
+)
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
-
     from soundmap.config import Config
 
 EPILOG = """\b
@@ -44,7 +49,7 @@ class Commands(TyperGroup):
         try:
             return super().invoke(ctx)
         except SoundmapError as error:
-            _show_error(error)
+            show_error(error)
             raise typer.Exit(error.exit_code) from None
         except KeyboardInterrupt:
             print("soundmap: stopped; nothing was left half written.", file=sys.stderr)
@@ -66,30 +71,6 @@ LogArgument = Annotated[
 LogsArgument = Annotated[
     list[Path],
     typer.Argument(metavar="LOG", help="Recorded logs: .mcap files or rosbag2 folders."),
-]
-ConfigOption = Annotated[
-    list[Path] | None,
-    typer.Option(
-        "--config",
-        metavar="FILE",
-        help="Settings to use instead of the defaults, as TOML. May be repeated: a later file "
-        "overrides an earlier one key by key. Default: configs/default.toml's values.",
-    ),
-]
-ForceOption = Annotated[
-    bool,
-    typer.Option(
-        "--force",
-        help="Replace the folder of an earlier run, with all that is in it, once the new one is "
-        "complete. Without it, a folder that is not empty is refused.",
-    ),
-]
-QuietOption = Annotated[
-    bool, typer.Option("--quiet", "-q", help="Print nothing but errors: no progress, no summary.")
-]
-JsonOption = Annotated[
-    bool,
-    typer.Option("--json", help="Print one JSON object on the standard output and nothing else."),
 ]
 
 
@@ -119,8 +100,8 @@ def info(log: LogArgument, config: ConfigOption = None, *, as_json: JsonOption =
     from soundmap.logs.summary import log_summary
     from soundmap.outputs.summary import log_view
 
-    summary = log_summary(log, _config(config)).as_dict()
-    _print(summary, log_view, as_json=as_json)
+    summary = log_summary(log, resolved_config(config)).as_dict()
+    print_result(summary, log_view, as_json=as_json)
 
 
 @app.command()
@@ -176,7 +157,7 @@ def process(
         )
     start = _parsed_start_pose(start_pose)
     folders = _run_folders(logs, out)
-    settings = _config(config)
+    settings = resolved_config(config)
     outcomes = []
     for log, folder in zip(logs, folders, strict=True):
         try:
@@ -187,91 +168,14 @@ def process(
         except SoundmapError as error:
             if len(logs) == 1:
                 raise
-            _show_error(error)
+            show_error(error)
             outcomes.append({"log": log.name, "error": str(error), "exit_code": error.exit_code})
     _show_runs(outcomes, quiet=quiet, as_json=as_json)
     _exit_unless_good(outcomes, strict=strict)
 
 
-@app.command()
-def diff(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of the run to be looked at.")],
-    background: Annotated[
-        Path,
-        typer.Argument(
-            metavar="BACKGROUND", help="Folder of a run of the same site to compare with."
-        ),
-    ],
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR", help="Folder to write. Default: a folder here named RUN-BACKGROUND."
-        ),
-    ] = None,
-    config: ConfigOption = None,
-    *,
-    force: ForceOption = False,
-    quiet: QuietOption = False,
-    as_json: JsonOption = False,
-) -> None:
-    """Show what is louder in one run than in another.
-
-    Writes a folder with the difference of the two power maps in dB and its local maxima.
-    """
-    from soundmap.outputs.new_folder import folder_for_difference, new_folder
-    from soundmap.outputs.run_folder import write_diff
-    from soundmap.outputs.summary import diff_view
-    from soundmap.replay import compared
-
-    settings = _config(config)
-    folder = out if out is not None else folder_for_difference(run, background)
-    compared_files = [run / "map.yaml", background / "map.yaml"]
-    with new_folder(folder, force=force, inputs=compared_files) as new:
-        began = perf_counter()
-        comparison = compared(run, background, settings.diff, settings.detect)
-        timings_s = {"compare": perf_counter() - began}
-        report = write_diff(
-            comparison.ratio,
-            new,
-            room=comparison.room,
-            run=run,
-            background=background,
-            config=settings.diff,
-            timings_s=timings_s,
-        )
-    if not quiet or as_json:
-        _print({**report, "folder": str(folder)}, diff_view, as_json=as_json)
-
-
-@app.command()
-def evaluate(
-    run: Annotated[
-        Path, typer.Argument(metavar="RUN", help="Folder that process or diff has written.")
-    ],
-    sources: Annotated[
-        Path,
-        typer.Option(
-            metavar="TRUTH.csv", help="Where the sources truly are: columns id,x_m,y_m, and more."
-        ),
-    ],
-    trajectory: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="TRUTH.tum",
-            help="Where the robot truly was, in the frame of the same map, in TUM format.",
-        ),
-    ] = None,
-    *,
-    as_json: JsonOption = False,
-) -> None:
-    """Compare a run with the truth, as in the paper's Table 2.
-
-    A source counts as detected when something was found within 0.5 m of it.
-    """
-    from soundmap.evaluate import evaluation, evaluation_view
-
-    result = evaluation(run, sources, trajectory)
-    _print(result.as_dict(), lambda _: evaluation_view(result), as_json=as_json)
+app.command()(cli_runs.diff)
+app.command()(cli_runs.evaluate)
 
 
 @app.command()
@@ -322,12 +226,6 @@ def main() -> None:
 
 def _stop(number: int, _frame: object) -> None:
     raise SystemExit(128 + number)
-
-
-def _config(files: list[Path] | None) -> Config:
-    from soundmap.config import loaded_config
-
-    return loaded_config(files or [])
 
 
 def _processed(
@@ -393,11 +291,11 @@ def _show_runs(outcomes: list[dict[str, Any]], *, quiet: bool, as_json: bool) ->
     from soundmap.outputs.summary import run_view
 
     if as_json and len(outcomes) > 1:
-        _print({"runs": outcomes}, run_view, as_json=True)
+        print_result({"runs": outcomes}, run_view, as_json=True)
     elif as_json or not quiet:
         for outcome in outcomes:
             if "error" not in outcome:
-                _print(outcome, run_view, as_json=as_json)
+                print_result(outcome, run_view, as_json=as_json)
 
 
 def _exit_unless_good(outcomes: list[dict[str, Any]], *, strict: bool) -> None:
@@ -412,37 +310,7 @@ def _exit_unless_good(outcomes: list[dict[str, Any]], *, strict: bool) -> None:
                     f"{' and more' if len(lost) > 1 else ''}) and --strict was given. "
                     f"The results are in {outcome['folder']}/."
                 )
-                _show_error(error)
+                show_error(error)
                 failures.append(0)
     if failures:
         raise typer.Exit(max(failures) or DataLossError.exit_code)
-
-
-def _print(
-    content: Mapping[str, Any],
-    view: Callable[[Mapping[str, Any]], RenderableType],
-    *,
-    as_json: bool,
-) -> None:
-    """Print a result for a program or for a person."""
-    if as_json:
-        from soundmap.outputs.report import json_text
-
-        print(json_text(content))
-    else:
-        from rich.console import Console
-
-        Console(highlight=False).print(view(content))
-
-
-def _show_error(error: SoundmapError) -> None:
-    """One panel on a terminal; plain, unbroken lines anywhere else."""
-    if not sys.stderr.isatty():
-        print(f"soundmap: error: {error}", file=sys.stderr)
-        return
-    from rich.console import Console
-    from rich.panel import Panel
-    from rich.text import Text
-
-    panel = Panel(Text(str(error)), title="soundmap: error", border_style="red")
-    Console(stderr=True).print(panel)

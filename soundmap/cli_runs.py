@@ -1,0 +1,97 @@
+"""Commands on finished run folders: compare, judge."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated
+
+import typer
+
+from soundmap.terminal import (
+    ConfigOption,
+    ForceOption,
+    JsonOption,
+    QuietOption,
+    print_result,
+    resolved_config,
+)
+
+
+def diff(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of the run to be looked at.")],
+    background: Annotated[
+        Path,
+        typer.Argument(
+            metavar="BACKGROUND", help="Folder of a run of the same site to compare with."
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="Folder to write. Default: a folder here named RUN-BACKGROUND."
+        ),
+    ] = None,
+    config: ConfigOption = None,
+    *,
+    force: ForceOption = False,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Show what is louder in one run than in another.
+
+    Writes a folder with the difference of the two power maps in dB and its local maxima.
+    """
+    from soundmap.outputs.new_folder import folder_for_difference, new_folder
+    from soundmap.outputs.run_folder import write_diff
+    from soundmap.outputs.summary import diff_view
+    from soundmap.replay import compared
+
+    settings = resolved_config(config)
+    folder = out if out is not None else folder_for_difference(run, background)
+    compared_files = [run / "map.yaml", background / "map.yaml"]
+    with new_folder(folder, force=force, inputs=compared_files) as new:
+        began = perf_counter()
+        comparison = compared(run, background, settings.diff, settings.detect)
+        timings_s = {"compare": perf_counter() - began}
+        report = write_diff(
+            comparison.ratio,
+            new,
+            room=comparison.room,
+            run=run,
+            background=background,
+            config=settings.diff,
+            timings_s=timings_s,
+        )
+    if not quiet or as_json:
+        print_result({**report, "folder": str(folder)}, diff_view, as_json=as_json)
+
+
+def evaluate(
+    run: Annotated[
+        Path, typer.Argument(metavar="RUN", help="Folder that process or diff has written.")
+    ],
+    sources: Annotated[
+        Path,
+        typer.Option(
+            metavar="TRUTH.csv", help="Where the sources truly are: columns id,x_m,y_m, and more."
+        ),
+    ],
+    trajectory: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="TRUTH.tum",
+            help="Where the robot truly was, in the frame of the same map, in TUM format.",
+        ),
+    ] = None,
+    *,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare a run with the truth, as in the paper's Table 2.
+
+    A source counts as detected when something was found within 0.5 m of it.
+    """
+    from soundmap.evaluate import evaluation, evaluation_view
+
+    result = evaluation(run, sources, trajectory)
+    print_result(result.as_dict(), lambda _: evaluation_view(result), as_json=as_json)

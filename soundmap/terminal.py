@@ -1,0 +1,79 @@
+"""What every command shares: its options, and how results and errors are printed."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from soundmap.errors import SoundmapError
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+    from soundmap.config import Config
+
+ConfigOption = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--config",
+        metavar="FILE",
+        help="Settings to use instead of the defaults, as TOML. May be repeated: a later file "
+        "overrides an earlier one key by key. Default: configs/default.toml's values.",
+    ),
+]
+ForceOption = Annotated[
+    bool,
+    typer.Option(
+        "--force",
+        help="Replace the folder of an earlier run, with all that is in it, once the new one is "
+        "complete. Without it, a folder that is not empty is refused.",
+    ),
+]
+QuietOption = Annotated[
+    bool, typer.Option("--quiet", "-q", help="Print nothing but errors: no progress, no summary.")
+]
+JsonOption = Annotated[
+    bool,
+    typer.Option("--json", help="Print one JSON object on the standard output and nothing else."),
+]
+
+
+def resolved_config(files: list[Path] | None) -> Config:
+    """The settings of the files given, over the defaults."""
+    from soundmap.config import loaded_config
+
+    return loaded_config(files or [])
+
+
+def print_result(
+    content: Mapping[str, Any],
+    view: Callable[[Mapping[str, Any]], RenderableType],
+    *,
+    as_json: bool,
+) -> None:
+    """Print a result for a program or for a person."""
+    if as_json:
+        from soundmap.outputs.report import json_text
+
+        print(json_text(content))
+    else:
+        from rich.console import Console
+
+        Console(highlight=False).print(view(content))
+
+
+def show_error(error: SoundmapError) -> None:
+    """One panel on a terminal; plain, unbroken lines anywhere else."""
+    if not sys.stderr.isatty():
+        print(f"soundmap: error: {error}", file=sys.stderr)
+        return
+    from rich.console import Console
+    from rich.panel import Panel
+    from rich.text import Text
+
+    panel = Panel(Text(str(error)), title="soundmap: error", border_style="red")
+    Console(stderr=True).print(panel)
