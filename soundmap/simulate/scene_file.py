@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import difflib
+import math
 import tomllib
 import types
 import typing
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +18,14 @@ from pydantic import BaseModel, ValidationError
 
 from soundmap.errors import ConfigError
 from soundmap.simulate.floor_plan import FloorPlan, crossings, distance_to_walls, odd_crossings
+from soundmap.simulate.path import Motion, driven
 from soundmap.simulate.scene import Scene, Source
 from soundmap.simulate.toml_lines import Path as Place
 from soundmap.simulate.toml_lines import line_of, toml_lines
 
 Fault = tuple[Place, str]
+ROBOT_HEIGHT_M = 0.8
+"""What begins higher is no obstacle."""
 
 
 def loaded_scene(path: Path) -> Scene:
@@ -58,6 +63,20 @@ def floor_plan(scene: Scene) -> FloorPlan:
     """The walls of a scene."""
     return FloorPlan.from_rings(
         [wall.corners_m for wall in scene.walls], [wall.reflection for wall in scene.walls]
+    )
+
+
+def motion_of(scene: Scene) -> Motion:
+    """The robot's true motion."""
+    robot = scene.robot
+    return driven(
+        robot.way_points_m,
+        speed_m_s=robot.speed_m_s,
+        acceleration_m_s2=robot.acceleration_m_s2,
+        turn_radius_m=robot.turn_radius_m,
+        turn_rate_rad_s=robot.turn_rate_rad_s,
+        rest_s=robot.rest_s,
+        heading_rad=None if robot.heading_deg is None else math.radians(robot.heading_deg),
     )
 
 
@@ -149,25 +168,52 @@ def _source_faults(
 
 
 def _route_faults(scene: Scene, plan: FloorPlan) -> Iterator[Fault]:
+    """Way points and legs that are impossible; else places where the robot would bump."""
     place = ("robot", "way_points_m")
-    radius = scene.robot.radius_m
-    solid = [thing.outline() for thing in scene.furniture]
-    for number, point in enumerate(scene.robot.way_points_m, start=1):
-        name = f"way point {number} at {_shown(point)}"
-        if not plan.contains(point):
-            yield place, f"{name} {_place_outside(scene, point)}; move it to open floor"
-            continue
-        room_left = float(distance_to_walls(point, plan.start_m, plan.end_m))
-        if room_left < radius:
-            yield place, f"{name} is {room_left:.2f} m from a wall, the robot's radius {radius:g} m"
-        for thing, outline in zip(scene.furniture, solid, strict=True):
-            if odd_crossings(point, outline, np.roll(outline, -1, axis=0)):
-                yield place, f"{name} lies in furniture {thing.name!r}"
-    legs = zip(scene.robot.way_points_m[:-1], scene.robot.way_points_m[1:], strict=True)
-    for number, (start, end) in enumerate(legs, start=1):
-        inside = bool(plan.contains(start) and plan.contains(end))
-        if inside and bool(plan.crossed(start, end)):
-            yield place, f"the way from way point {number} to {number + 1} crosses a wall"
+    points = scene.robot.way_points_m
+    outside = [index for index, point in enumerate(points) if not plan.contains(point)]
+    for index in outside:
+        where = _place_outside(scene, points[index])
+        yield place, f"{_way_point(points, index)} {where}; move it to open floor"
+    if outside:
+        return
+    crossed = [i for i, leg in enumerate(pairwise(points)) if plan.crossed(*leg)]
+    for index in crossed:
+        yield place, f"the way from way point {index + 1} to {index + 2} crosses a wall"
+    if not crossed:
+        yield from _bump_faults(scene)
+
+
+def _bump_faults(scene: Scene) -> Iterator[Fault]:
+    """Things that the robot's rounded way comes too near to, each where it is nearest."""
+    motion = motion_of(scene).pose[::50, :2]
+    things = [(f"wall {wall.name!r}", np.array(wall.corners_m)) for wall in scene.walls]
+    things += [
+        (f"furniture {thing.name!r}", thing.outline())
+        for thing in scene.furniture
+        if thing.bottom_m < ROBOT_HEIGHT_M
+    ]
+    for source in scene.sources:
+        outline = source.box_outline()
+        if outline is not None and source.position_m[2] < ROBOT_HEIGHT_M:
+            things.append((f"the cabinet of source {source.id!r}", outline))
+    for name, corners in things:
+        following = np.roll(corners, -1, axis=0)
+        distance = distance_to_walls(motion, corners, following)
+        if not name.startswith("wall"):
+            distance = np.where(odd_crossings(motion, corners, following), 0.0, distance)
+        nearest = int(np.argmin(distance))
+        if distance[nearest] < scene.robot.radius_m:
+            yield (
+                ("robot", "way_points_m"),
+                f"at {_shown(tuple(motion[nearest].round(2)))} the robot comes within "
+                f"{distance[nearest]:.2f} m of {name}, its radius is {scene.robot.radius_m:g} m; "
+                "move a way point or lessen turn_radius_m",
+            )
+
+
+def _way_point(points: Sequence[tuple[float, float]], index: int) -> str:
+    return f"way point {index + 1} at {_shown(points[index])}"
 
 
 def _place_outside(scene: Scene, point: tuple[float, ...]) -> str:

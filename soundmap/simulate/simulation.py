@@ -21,9 +21,8 @@ from soundmap.simulate.audio_log import Progress, audio_messages
 from soundmap.simulate.drive_log import Drive, laser_messages, mount_message, odometry_messages
 from soundmap.simulate.log_writer import Topic, write_log
 from soundmap.simulate.map_image import drawn_map
-from soundmap.simulate.path import Motion, driven
 from soundmap.simulate.scene import Run, Scene
-from soundmap.simulate.scene_file import loaded_scene
+from soundmap.simulate.scene_file import loaded_scene, motion_of
 from soundmap.simulate.sound_field import PERIOD_SAMPLES, source_spectrum
 from soundmap.simulate.spectra import band_level_db
 
@@ -147,26 +146,15 @@ def drive_of(scene: Scene, run: str | None = None) -> tuple[Drive, Run]:
     return Drive(scene, motion_of(scene), chosen.sources, people, start_ns), chosen
 
 
-def motion_of(scene: Scene) -> Motion:
-    """The robot's true motion."""
-    robot = scene.robot
-    return driven(
-        robot.way_points_m,
-        speed_m_s=robot.speed_m_s,
-        acceleration_m_s2=robot.acceleration_m_s2,
-        turn_radius_m=robot.turn_radius_m,
-        turn_rate_rad_s=robot.turn_rate_rad_s,
-        rest_s=robot.rest_s,
-        heading_rad=None if robot.heading_deg is None else math.radians(robot.heading_deg),
-    )
-
-
 def sources_csv(scene: Scene, active: tuple[str, ...], folder: Path) -> str:
-    """Truth: the sources that sound, with their in-band level at 1 m on their axis."""
+    """Truth: the sources that sound, with their in-band level at 1 m on their axis.
+
+    Moving sources are left out: they are nowhere, and what is sought are fixed sources.
+    """
     rows = ["id,x_m,y_m,z_m,level_1m_db,level_dba_5cm,sound"]
     rate = scene.audio.rate_hz
     for source in scene.sources:
-        if source.id not in active:
+        if source.id not in active or source.way_points_m:
             continue
         rng = np.random.default_rng(scene.seed)
         spectrum = source_spectrum(source, folder, PERIOD_SAMPLES, rate, rng)
