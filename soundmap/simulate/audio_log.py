@@ -13,10 +13,10 @@ from soundmap.geometry import FloatArray, Mount
 from soundmap.simulate.clocks import arrivals_ns, kept, stamps_ns
 from soundmap.simulate.drive_log import Drive
 from soundmap.simulate.log_writer import Message
-from soundmap.simulate.messages import audio_frame_message, raw_audio_message
+from soundmap.simulate.messages import audio_info_message, audio_message
 from soundmap.simulate.noise import ambient_table, drive_table, self_noise_rms
 from soundmap.simulate.propagation import KNOT_STEP, FloatTable
-from soundmap.simulate.scene import Array, Scene
+from soundmap.simulate.scene import Array
 from soundmap.simulate.sound_field import PERIOD_SAMPLES, SoundField, sound_field
 
 STRETCH_SAMPLES = 200 * KNOT_STEP
@@ -158,13 +158,22 @@ def audio_messages(
             progress((index + 1) / blocks)
         if keep[index]:
             stamp = int(stamps[index])
-            yield Message(int(arrivals[index]), stamp, _encoded(scene, stamp, block))
+            data = audio_message(
+                audio.schema_name,
+                stamp,
+                scene.array.frame,
+                block,
+                rate_hz=audio.rate_hz,
+                first_frame=index * audio.block_frames,
+            )
+            yield Message(int(arrivals[index]), stamp, data)
 
 
-def _encoded(scene: Scene, stamp_ns: int, block: NDArray[np.int16]) -> bytes:
-    if scene.audio.schema_name == "foxglove.RawAudio":
-        return raw_audio_message(stamp_ns, block, scene.audio.rate_hz)
-    return audio_frame_message(stamp_ns, scene.array.frame, block, scene.audio.rate_hz)
+def info_message(drive: Drive) -> Message:
+    """The one AudioInfo of a recorder that tells channels and rate apart from the samples."""
+    channels = len(drive.scene.array.nominal_positions())
+    data = audio_info_message(channels, drive.scene.audio.rate_hz)
+    return Message(drive.start_ns, drive.start_ns, data)
 
 
 def _blocks(

@@ -72,6 +72,32 @@ DEFINITIONS: dict[str, str] = {
             _CLOCK,
         ]
     ),
+    "audio_common_msgs/msg/AudioDataStamped": _RULE.join(
+        [
+            "std_msgs/Header header\naudio_common_msgs/AudioData audio",
+            _HEADER,
+            _CLOCK,
+            "MSG: audio_common_msgs/AudioData\nuint8[] data",
+        ]
+    ),
+    "audio_common_msgs/msg/AudioInfo": "uint8 channels\nuint32 sample_rate\n"
+    "string sample_format\nuint32 bitrate\nstring coding_format",
+    "audio_msgs/msg/Audio": _RULE.join(
+        [
+            "std_msgs/Header header\nuint64 seq_num\nuint32 frames\nuint32 channels\n"
+            "int32 sample_rate\nstring encoding\nuint8 is_bigendian\nuint8 layout\n"
+            "uint32 step\nuint8[] data",
+            _HEADER,
+            _CLOCK,
+        ]
+    ),
+    "foxglove_msgs/msg/RawAudio": _RULE.join(
+        [
+            "builtin_interfaces/Time timestamp\nuint8[] data\nstring format\n"
+            "uint32 sample_rate\nuint32 number_of_channels",
+            _CLOCK,
+        ]
+    ),
 }
 """ROS 2 message definitions, as recorded beside the messages."""
 
@@ -107,8 +133,11 @@ class CdrWriter:
 
     def header(self, stamp_ns: int, frame: str) -> CdrWriter:
         """Append a std_msgs/Header."""
-        self.value("i", stamp_ns // 1_000_000_000).value("I", stamp_ns % 1_000_000_000)
-        return self.string(frame)
+        return self.time(stamp_ns).string(frame)
+
+    def time(self, stamp_ns: int) -> CdrWriter:
+        """Append a builtin_interfaces/Time."""
+        return self.value("i", stamp_ns // 1_000_000_000).value("I", stamp_ns % 1_000_000_000)
 
     def quaternion(self, yaw_rad: float) -> CdrWriter:
         """Append a rotation about the vertical."""
@@ -162,17 +191,44 @@ def transform_message(
     return writer.done()
 
 
-def audio_frame_message(
-    stamp_ns: int, frame: str, samples: NDArray[np.int16], rate_hz: float
+def audio_message(
+    schema: str,
+    stamp_ns: int,
+    frame: str,
+    samples: NDArray[np.int16],
+    *,
+    rate_hz: float,
+    first_frame: int,
 ) -> bytes:
-    """An audio_utils_msgs/AudioFrame of samples (frames, channels), interleaved."""
-    frames, channels = samples.shape
-    writer = CdrWriter().header(stamp_ns, frame).string("signed_16")
-    writer.value("I", channels, round(rate_hz), frames)
-    return writer.array(samples.astype("<i2").reshape(-1).view(np.uint8)).done()
+    """Samples (frames, channels) as a message of one of the audio schemas, interleaved.
+
+    ``first_frame`` counts the frames before these, for the schema that tells it.
+    """
+    rate, (frames, channels) = round(rate_hz), samples.shape
+    if schema == "foxglove.RawAudio":
+        return _protobuf_raw_audio(stamp_ns, samples, rate)
+    data = samples.astype("<i2").reshape(-1).view(np.uint8)
+    writer = CdrWriter()
+    if schema == "foxglove_msgs/msg/RawAudio":
+        writer.time(stamp_ns).array(data).string("pcm-s16")
+        return writer.value("I", rate, channels).done()
+    writer.header(stamp_ns, frame)
+    if schema == "audio_utils_msgs/msg/AudioFrame":
+        writer.string("signed_16").value("I", channels, rate, frames)
+    elif schema == "audio_msgs/msg/Audio":
+        writer.value("Q", first_frame).value("I", frames, channels).value("i", rate)
+        writer.string("S16LE").value("B", 0, 0).value("I", 2 * channels)
+    return writer.array(data).done()
 
 
-def raw_audio_message(stamp_ns: int, samples: NDArray[np.int16], rate_hz: float) -> bytes:
+def audio_info_message(channels: int, rate_hz: float) -> bytes:
+    """An audio_common_msgs/AudioInfo: what AudioDataStamped leaves out."""
+    rate = round(rate_hz)
+    writer = CdrWriter().value("B", channels).value("I", rate).string("S16LE")
+    return writer.value("I", rate * channels * 16).string("WAVE").done()
+
+
+def _protobuf_raw_audio(stamp_ns: int, samples: NDArray[np.int16], rate: int) -> bytes:
     """A protobuf foxglove.RawAudio of samples (frames, channels), interleaved."""
     seconds, nanos = divmod(stamp_ns, 1_000_000_000)
     clock = b"\x08" + _varint(seconds) + b"\x10" + _varint(nanos)
@@ -182,7 +238,7 @@ def raw_audio_message(stamp_ns: int, samples: NDArray[np.int16], rate_hz: float)
             b"\x0a" + _varint(len(clock)) + clock,
             b"\x12" + _varint(len(data)) + data,
             b"\x1a" + _varint(7) + b"pcm-s16",
-            b"\x25" + struct.pack("<I", round(rate_hz)),
+            b"\x25" + struct.pack("<I", rate),
             b"\x2d" + struct.pack("<I", samples.shape[1]),
         ]
     )

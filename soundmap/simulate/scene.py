@@ -25,6 +25,15 @@ Sound = Literal[
 ]
 
 
+AudioSchema = Literal[
+    "audio_utils_msgs/msg/AudioFrame",
+    "foxglove.RawAudio",
+    "foxglove_msgs/msg/RawAudio",
+    "audio_common_msgs/msg/AudioDataStamped",
+    "audio_msgs/msg/Audio",
+]
+
+
 class Table(BaseModel):
     """One table of a scene: nothing unknown in it, nothing changed once read."""
 
@@ -264,10 +273,9 @@ class Audio(Table):
     """How the recorder writes sound."""
 
     topic: str = "/audio"
-    schema_name: Literal["audio_utils_msgs/msg/AudioFrame", "foxglove.RawAudio"] = (
-        "audio_utils_msgs/msg/AudioFrame"
-    )
-    """AudioFrame is stamped at the end of its block, RawAudio (protobuf) at the start."""
+    schema_name: AudioSchema = "audio_utils_msgs/msg/AudioFrame"
+    """AudioFrame is stamped at the end of its block, all others at the start. foxglove.RawAudio
+    is protobuf; AudioDataStamped has its AudioInfo, sent once, on ``<topic>_info``."""
     rate_hz: Positive = 48000.0
     block_frames: Annotated[int, Field(ge=16)] = 480
     clock: Clock = Clock()

@@ -17,7 +17,7 @@ import tomli_w
 from soundmap.errors import ConfigError, OutputError
 from soundmap.geometry import wrapped_angle
 from soundmap.map_file import map_files
-from soundmap.simulate.audio_log import Progress, audio_messages
+from soundmap.simulate.audio_log import Progress, audio_messages, info_message
 from soundmap.simulate.drive_log import Drive, laser_messages, mount_message, odometry_messages
 from soundmap.simulate.log_writer import Topic, write_log
 from soundmap.simulate.map_image import drawn_map
@@ -215,6 +215,10 @@ def _topics(drive: Drive, run: str, folder: Path, progress: Progress | None) -> 
         topics.append(Topic("/tf", "tf2_msgs/msg/TFMessage", transforms))
     sound = audio_messages(drive, folder, random(2), progress)
     topics.append(Topic(scene.audio.topic, scene.audio.schema_name, sound))
+    if scene.audio.schema_name == "audio_common_msgs/msg/AudioDataStamped":
+        info = [info_message(drive)]
+        name = f"{scene.audio.topic}_info"
+        topics.append(Topic(name, "audio_common_msgs/msg/AudioInfo", info, latched=True))
     for index, laser in enumerate(scene.lasers):
         scans = laser_messages(drive, laser, random(10 + index))
         topics.append(Topic(laser.topic, "sensor_msgs/msg/LaserScan", scans))

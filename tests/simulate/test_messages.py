@@ -7,10 +7,10 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from soundmap.simulate.messages import (
     DEFINITIONS,
-    audio_frame_message,
+    audio_info_message,
+    audio_message,
     laser_message,
     odometry_message,
-    raw_audio_message,
     raw_audio_schema,
     transform_message,
 )
@@ -69,15 +69,49 @@ def test_transforms_come_back() -> None:
     assert (second.header.frame_id, second.transform.translation.z) == ("base", 1.0)
 
 
+SAMPLES = np.arange(-300, 300, dtype=np.int16).reshape(200, 3)
+
+
+def encoded(schema: str) -> bytes:
+    return audio_message(schema, STAMP, "mic_array", SAMPLES, rate_hz=48000.0, first_frame=960)
+
+
+def samples_in(data: np.ndarray) -> np.ndarray:
+    return np.frombuffer(bytes(data), "<i2").reshape(-1, 3)
+
+
 def test_an_audio_frame_comes_back() -> None:
-    samples = np.arange(-30, 30, dtype=np.int16).reshape(20, 3)
-    frame = decoded(
-        audio_frame_message(STAMP, "mic_array", samples, 48000.0),
-        "audio_utils_msgs/msg/AudioFrame",
-    )
+    name = "audio_utils_msgs/msg/AudioFrame"
+    frame = decoded(encoded(name), name)
     assert (frame.format, frame.channel_count, frame.sampling_frequency) == ("signed_16", 3, 48000)
-    assert frame.frame_sample_count == 20
-    assert np.array_equal(frame.data.view("<i2").reshape(20, 3), samples)
+    assert (frame.frame_sample_count, frame.header.frame_id) == (200, "mic_array")
+    assert np.array_equal(samples_in(frame.data), SAMPLES)
+
+
+def test_audio_of_the_gstreamer_bridge_comes_back() -> None:
+    name = "audio_msgs/msg/Audio"
+    audio = decoded(encoded(name), name)
+    assert (audio.seq_num, audio.frames, audio.channels, audio.sample_rate) == (960, 200, 3, 48000)
+    assert (audio.encoding, audio.is_bigendian, audio.layout) == ("S16LE", 0, 0)
+    assert np.array_equal(samples_in(audio.data), SAMPLES)
+
+
+def test_stamped_audio_data_and_its_info_come_back() -> None:
+    name = "audio_common_msgs/msg/AudioDataStamped"
+    audio = decoded(encoded(name), name)
+    assert (audio.header.stamp.sec, audio.header.stamp.nanosec) == divmod(STAMP, 10**9)
+    assert np.array_equal(samples_in(audio.audio.data), SAMPLES)
+    info = decoded(audio_info_message(3, 48000.0), "audio_common_msgs/msg/AudioInfo")
+    assert (info.channels, info.sample_rate, info.sample_format) == (3, 48000, "S16LE")
+    assert (info.bitrate, info.coding_format) == (2_304_000, "WAVE")
+
+
+def test_raw_audio_of_ros_comes_back() -> None:
+    name = "foxglove_msgs/msg/RawAudio"
+    audio = decoded(encoded(name), name)
+    assert (audio.timestamp.sec, audio.timestamp.nanosec) == divmod(STAMP, 10**9)
+    assert (audio.format, audio.sample_rate, audio.number_of_channels) == ("pcm-s16", 48000, 3)
+    assert np.array_equal(samples_in(audio.data), SAMPLES)
 
 
 def test_raw_audio_comes_back_by_the_descriptors_in_the_log() -> None:
@@ -85,8 +119,7 @@ def test_raw_audio_comes_back_by_the_descriptors_in_the_log() -> None:
     for file in descriptor_pb2.FileDescriptorSet.FromString(raw_audio_schema()).file:
         pool.Add(file)
     kind = message_factory.GetMessageClass(pool.FindMessageTypeByName("foxglove.RawAudio"))
-    samples = np.arange(-300, 300, dtype=np.int16).reshape(200, 3)
-    audio = kind.FromString(raw_audio_message(STAMP, samples, 16000.0))
+    audio = kind.FromString(encoded("foxglove.RawAudio"))
     assert audio.timestamp.seconds * 10**9 + audio.timestamp.nanos == STAMP
-    assert (audio.format, audio.sample_rate, audio.number_of_channels) == ("pcm-s16", 16000, 3)
-    assert np.array_equal(np.frombuffer(audio.data, "<i2").reshape(200, 3), samples)
+    assert (audio.format, audio.sample_rate, audio.number_of_channels) == ("pcm-s16", 48000, 3)
+    assert np.array_equal(samples_in(audio.data), SAMPLES)
