@@ -11,10 +11,10 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from soundmap.config import Config, DetectConfig, DiffConfig
+from soundmap.config import Config, DetectConfig, DiffConfig, ScanConfig
 from soundmap.detect.difference import changed_places, power_ratio
 from soundmap.detect.source_list import detect_sources
-from soundmap.errors import NothingUsableError, OutputError
+from soundmap.errors import ConfigError, NothingUsableError, OutputError
 from soundmap.fuse.accumulate import PowerAccumulator
 from soundmap.fuse.power_map import fused_scans, level_reference, power_map_frame
 from soundmap.grid import OccupancyGrid
@@ -25,6 +25,7 @@ from soundmap.outputs.progress import Progress, Stage
 from soundmap.outputs.run_folder import read_power_map
 from soundmap.run import Run
 from soundmap.scan.audio_scan import audio_scans
+from soundmap.scan.spectrum import band_bins
 from soundmap.sound import AudioScan, AudioScans, LevelReference, PowerRatio
 
 
@@ -61,6 +62,7 @@ def process(
     array = log.array
     if array is None:
         raise ValueError("the log was opened without audio")
+    _check_band(log, config.scan)
     start_ns, duration_s = int(log.odometry.time_ns[0]), log.duration_s
 
     with clock.stage("localize", duration_s) as stage:
@@ -159,6 +161,15 @@ def compared(run: Path, background: Path, diff: DiffConfig, detect: DetectConfig
         min_ratio_db=diff.min_ratio_db,
     )
     return Comparison(ratio, read_map(run / "map.yaml"), run, background)
+
+
+def _check_band(log: RobotLog, scan: ScanConfig) -> None:
+    """The band must be one that the log's sample rate holds."""
+    window = round(scan.window_s * log.sample_rate_hz)
+    try:
+        band_bins(log.sample_rate_hz, window, low_hz=scan.low_hz, high_hz=scan.high_hz)
+    except ValueError as error:
+        raise ConfigError(f"{log.path}: {error} in [scan].") from None
 
 
 class _Keeper:

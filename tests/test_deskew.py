@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
+import worlds
 
 from soundmap.deskew import deskewed_rays
 from soundmap.geometry import Mount, Trajectory, transformed
 from soundmap.sensors import LaserScan
-from tests import worlds
 
 
 def turning(rate_rad_s=1.5, speed_m_s=0.4):

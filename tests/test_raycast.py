@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
+import worlds
 
 from soundmap.grid import GridFrame, OccupancyGrid
 from soundmap.raycast import cast_ranges
-from tests import worlds
 
 
 def sampled_range(room, origin, bearing, *, range_max_m, step_m=0.001):

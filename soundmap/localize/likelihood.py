@@ -102,19 +102,32 @@ def beam_log_likelihood(
     return np.log(density)
 
 
-def matched_share(
-    room: OccupancyGrid, pose: FloatArray, rays: Rays, *, tolerance_m: float
-) -> float:
-    """Share of a scan's returns that lie where the map shows a surface, seen from ``pose``.
+@dataclass(frozen=True)
+class Agreement:
+    """How a scan's returns compare with the map, as seen from one pose.
 
-    Parameters
+    Attributes
     ----------
-    pose : ndarray, shape (3,)
-    tolerance_m : float
-        Greatest difference between measured and cast range [m].
+    matched : float
+        Share of the returns that lie where the map shows a surface.
+    beyond : float
+        Share that lies behind a surface of the map: things may stand before a wall that the map
+        lacks, but no ray passes through a wall that is there.
+    """
+
+    matched: float
+    beyond: float
+
+
+def scan_agreement(
+    room: OccupancyGrid, pose: FloatArray, rays: Rays, *, tolerance_m: float
+) -> Agreement:
+    """What the map explains of a scan, and what contradicts it, seen from ``pose``, shape (3,).
+
+    ``tolerance_m`` is the greatest difference between measured and cast range of a match [m].
     """
     if len(rays) == 0:
-        return 0.0
+        return Agreement(0.0, 0.0)
     origins = transformed(pose, rays.origin_m)
     bearings = rays.bearing_rad + pose[2]
     measured = rays.range_m
@@ -122,7 +135,9 @@ def matched_share(
     expected = cast_ranges(room, origins, bearings, range_max_m=limit)
     # Where the map's surface is grazed, the range says little: look around the end point as well.
     near = _near_occupied(room, composed(pose, _as_poses(rays.end_m))[:, :2])
-    return float(np.mean((np.abs(measured - expected) < tolerance_m) | near))
+    matched = (np.abs(measured - expected) < tolerance_m) | near
+    beyond = ~matched & (measured > expected)
+    return Agreement(float(matched.mean()), float(beyond.mean()))
 
 
 def _as_poses(points: FloatArray) -> FloatArray:

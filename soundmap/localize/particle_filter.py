@@ -8,7 +8,12 @@ from soundmap.config import LocalizeConfig
 from soundmap.deskew import Rays
 from soundmap.geometry import FloatArray, wrapped_angle
 from soundmap.grid import OccupancyGrid
-from soundmap.localize.likelihood import BeamModel, matched_share, scan_log_likelihood
+from soundmap.localize.likelihood import (
+    Agreement,
+    BeamModel,
+    scan_agreement,
+    scan_log_likelihood,
+)
 from soundmap.localize.motion import MotionNoise, moved
 from soundmap.localize.particles import (
     Particles,
@@ -96,7 +101,7 @@ class ParticleFilter:
             and estimate.spread_rad <= self._config.max_spread_rad
         )
 
-    def matched(self, estimate: PoseEstimate, rays: Rays) -> float:
-        """Share of a scan's returns that the map explains from the estimated pose."""
+    def agreement(self, estimate: PoseEstimate, rays: Rays) -> Agreement:
+        """How a scan compares with the map from the estimated pose."""
         tolerance = 3.0 * self._model.hit_sigma_m
-        return matched_share(self._room, estimate.pose, rays, tolerance_m=tolerance)
+        return scan_agreement(self._room, estimate.pose, rays, tolerance_m=tolerance)

@@ -18,6 +18,7 @@ from soundmap.errors import MapError
 from soundmap.geometry import FloatArray, Trajectory, composed, relative
 from soundmap.grid import OccupancyGrid
 from soundmap.localize.global_start import start_hypotheses
+from soundmap.localize.likelihood import Agreement
 from soundmap.localize.particle_filter import ParticleFilter
 from soundmap.localize.views import STAGE, View, chosen_views, joined_rays
 from soundmap.losses import LossLedger
@@ -27,8 +28,12 @@ LOST_AFTER_S = 2.0
 """Without a match for this long, the pose is sought in the whole map."""
 ODOMETRY_DRIFT = 0.2
 """Worst drift of any odometry in use [m/m and rad/m]."""
+FIRST_MATCH = 0.6
+"""Share of a scan that must match before any pose of the run is trusted."""
 ELSEWHERE_MATCH = 0.8
 """Share of a scan that must match to believe that the robot is where odometry cannot have led."""
+MOST_BEYOND = 0.10
+"""Share of a scan that may lie behind the map's walls where a pose has to be proved."""
 OPENING_NS = 300_000_000
 """Scans this close together are matched to the map as one."""
 MOST_PENDING = 20_000
@@ -37,11 +42,11 @@ MOST_PENDING = 20_000
 
 @dataclass(frozen=True)
 class Fix:
-    """The pose found for a view, the share of it that the map explains, and whether to trust it."""
+    """The pose found for a view, how the map agrees with it there, and whether to trust it."""
 
     view: View
     pose: FloatArray
-    matched: float
+    agreement: Agreement
     usable: bool
 
     @property
@@ -152,7 +157,7 @@ class _Localizer:
         fix = self._fix(self._filter, view)
         self.fixes.append(fix)
         self._anchor = fix if fix.usable else self._anchor
-        if fix.matched >= self._config.min_match:
+        if fix.agreement.matched >= self._config.min_match:
             self._matched_ns, self._patience_s = view.time_ns, LOST_AFTER_S
         if fix.usable:
             self._look_back(self._filter)
@@ -173,12 +178,20 @@ class _Localizer:
 
     def _fix(self, particle_filter: ParticleFilter, view: View) -> Fix:
         estimate = particle_filter.estimate()
-        matched = particle_filter.matched(estimate, view.rays)
-        needed = self._config.min_match
-        if self._anchor is not None and not _consistent(self._anchor, view, estimate.pose):
-            needed = max(needed, ELSEWHERE_MATCH)
-        usable = matched >= needed and particle_filter.concentrated(estimate)
-        return Fix(view, estimate.pose, matched, usable)
+        agreement = particle_filter.agreement(estimate, view.rays)
+        usable = particle_filter.concentrated(estimate) and self._believed(
+            view, estimate.pose, agreement
+        )
+        return Fix(view, estimate.pose, agreement, usable)
+
+    def _believed(self, view: View, pose: FloatArray, agreement: Agreement) -> bool:
+        """Whether the scan speaks for the pose, the more so the less is known of the run."""
+        needed, most_beyond = self._config.min_match, 1.0
+        if self._anchor is None:
+            needed, most_beyond = max(needed, FIRST_MATCH), MOST_BEYOND
+        elif not _consistent(self._anchor, view, pose):
+            needed, most_beyond = max(needed, ELSEWHERE_MATCH), MOST_BEYOND
+        return agreement.matched >= needed and agreement.beyond <= most_beyond
 
     def _look_back(self, particle_filter: ParticleFilter) -> None:
         """Run back over the views that came before the particles agreed."""
@@ -233,17 +246,24 @@ def _checked(
     )
     lost = int(np.count_nonzero(~trajectory.usable))
     if lost == len(trajectory):
-        matched = float(np.median([fix.matched for fix in fixes]))
-        left, right, bottom, top = room.frame.extent_m
-        raise MapError(
-            f"the laser scans do not match the map, which spans x {left:.1f} to {right:.1f} m and "
-            f"y {bottom:.1f} to {top:.1f} m: at the best pose found, {matched:.0%} of a scan's "
-            f"returns lie on its walls, expected {config.min_match:.0%} or more. Is it the map of "
-            "this site, are the scanners' mounts right, and is --start-pose (if given) that of "
-            "the first scan?"
-            if matched < config.min_match
-            else "the pose cannot be told from the laser scans: the map looks alike in several "
-            "places. Give the start with --start-pose X,Y,DEG."
-        )
+        raise MapError(_why_lost(fixes, room))
     losses.add("robot not localized", STAGE, effect="sound not fused", count=lost)
     return trajectory
+
+
+def _why_lost(fixes: list[Fix], room: OccupancyGrid) -> str:
+    matched = float(np.median([fix.agreement.matched for fix in fixes]))
+    beyond = float(np.median([fix.agreement.beyond for fix in fixes]))
+    if matched >= FIRST_MATCH and beyond <= MOST_BEYOND:
+        return (
+            "the pose cannot be told from the laser scans: the map looks alike in several "
+            "places. Give the start with --start-pose X,Y,DEG."
+        )
+    left, right, bottom, top = room.frame.extent_m
+    return (
+        f"the laser scans do not match the map, which spans x {left:.1f} to {right:.1f} m and "
+        f"y {bottom:.1f} to {top:.1f} m: at the best poses found, {matched:.0%} of a scan's "
+        f"returns lie on its walls (expected {FIRST_MATCH:.0%} or more) and {beyond:.0%} behind "
+        f"them (expected {MOST_BEYOND:.0%} or less). Is it the map of this site, are the scanners' "
+        "mounts right, and is --start-pose (if given) that of the first scan?"
+    )

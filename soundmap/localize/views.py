@@ -176,9 +176,9 @@ class _StandstillWitness:
         if len(first) != len(scan.range_m):
             return
         both = np.isfinite(first) & np.isfinite(scan.range_m)
-        moved_share = np.mean(np.abs(first[both] - scan.range_m[both]) > 0.2) if both.any() else 0.0
-        self._changed = self._changed + 1 if moved_share > 0.4 else 0
-        if self._changed >= 5:
+        moved_share = np.mean(np.abs(first[both] - scan.range_m[both]) > 0.1) if both.any() else 0.0
+        self._changed = self._changed + 1 if moved_share > 0.3 else 0
+        if self._changed >= 3:
             raise NothingUsableError(
                 "the odometry never moves although the laser scans show that the robot does. "
                 "Check the odometry topic ([topics] odometry); `soundmap info` lists them."

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import worlds
 
 from soundmap.config import FuseConfig
 from soundmap.fuse.accumulate import PowerAccumulator
@@ -8,7 +9,6 @@ from soundmap.geometry import Mount, Trajectory, transformed
 from soundmap.grid import GridFrame
 from soundmap.losses import LossLedger
 from soundmap.sound import AudioScan, LevelReference
-from tests import worlds
 
 TRUTH = worlds.driven([(1.0, 1.0), (5.0, 1.0), (5.0, 2.2)])
 SCANS = worlds.laser_scans(TRUTH, [worlds.FRONT, worlds.BACK], beams=721)

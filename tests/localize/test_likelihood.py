@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import worlds
 from scipy.integrate import quad
 
 from soundmap.deskew import deskewed_rays
@@ -7,11 +8,10 @@ from soundmap.geometry import transformed
 from soundmap.localize.likelihood import (
     BeamModel,
     beam_log_likelihood,
-    matched_share,
+    scan_agreement,
     scan_log_likelihood,
 )
 from soundmap.raycast import cast_ranges
-from tests import worlds
 
 MODEL = BeamModel(0.05, 0.8, 0.1, 0.1, 1.0, 30.0)
 TRUTH = worlds.driven([(1.0, 1.0), (4.0, 1.2)])
@@ -57,12 +57,18 @@ def test_the_true_pose_is_likelier_than_any_other_nearby():
     assert np.all(offsets[np.argmax(values)] == 0)
 
 
-def test_matched_share_counts_what_the_map_explains():
+def test_agreement_counts_what_the_map_explains_and_what_contradicts_it():
     rays, pose = rays_at(20)
     room = worlds.room()
-    assert matched_share(room, pose, rays, tolerance_m=0.15) > 0.98
-    assert matched_share(room, pose + np.array([0.8, 0.5, 0.7]), rays, tolerance_m=0.15) < 0.4
+    right = scan_agreement(room, pose, rays, tolerance_m=0.15)
+    assert right.matched > 0.98
+    assert right.beyond < 0.02
+    wrong = scan_agreement(room, pose + np.array([0.8, 0.5, 0.7]), rays, tolerance_m=0.15)
+    assert wrong.matched < 0.5
+    assert wrong.beyond > 0.2
     shortened = 1 - 0.4 * (np.arange(len(rays)) % 4 == 0)  # an obstacle before every fourth ray
     end = rays.origin_m + (rays.end_m - rays.origin_m) * shortened[:, None]
     blocked = type(rays)(rays.time_ns, rays.origin_m, end)
-    assert matched_share(room, pose, blocked, tolerance_m=0.15) == pytest.approx(0.75, abs=0.03)
+    agreement = scan_agreement(room, pose, blocked, tolerance_m=0.15)
+    assert agreement.matched == pytest.approx(0.75, abs=0.03)
+    assert agreement.beyond == 0.0

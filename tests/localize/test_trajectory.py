@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import worlds
 
 from soundmap.config import LocalizeConfig
 from soundmap.deskew import deskewed_rays
@@ -11,7 +12,6 @@ from soundmap.grid import GridFrame, OccupancyGrid
 from soundmap.localize.global_start import start_hypotheses
 from soundmap.localize.trajectory import estimate_trajectory
 from soundmap.losses import LossLedger
-from tests import worlds
 
 LOOP = [(1.0, 1.0), (5.5, 1.2), (4.0, 2.2), (1.2, 4.2), (1.0, 1.5)]
 TRUTH = worlds.driven(LOOP)
