@@ -100,7 +100,7 @@ def estimate_trajectory(
     localizer.start(opening, None if start_pose is None else np.array(start_pose))
     for view in chain(opening, views):
         localizer.add(view)
-    return _checked(localizer.fixes, room, config, losses)
+    return _checked(localizer.fixes, room, losses)
 
 
 def _opening(views: Iterator[View]) -> list[View]:
@@ -232,9 +232,7 @@ def _consistent(anchor: Fix, view: View, pose: FloatArray) -> bool:
     return bool(near and abs(off[2]) <= np.radians(20.0) + ODOMETRY_DRIFT * driven_m)
 
 
-def _checked(
-    fixes: list[Fix], room: OccupancyGrid, config: LocalizeConfig, losses: LossLedger
-) -> Trajectory:
+def _checked(fixes: list[Fix], room: OccupancyGrid, losses: LossLedger) -> Trajectory:
     """The fixes as a trajectory; an error if none of them may be trusted."""
     fixes = sorted(fixes, key=lambda fix: fix.time_ns)
     time_ns = np.array([fix.time_ns for fix in fixes], dtype=np.int64)
