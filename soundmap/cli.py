@@ -15,8 +15,10 @@ from typer.core import TyperGroup
 
 from soundmap import __version__, cli_runs
 from soundmap.errors import DataLossError, SoundmapError
+from soundmap.outputs.picture_format import PictureFormat
 from soundmap.terminal import (
     ConfigOption,
+    FiguresOption,
     ForceOption,
     JsonOption,
     QuietOption,
@@ -133,6 +135,7 @@ def process(
             "counter-clockwise from the x axis. Default: it is searched for in the whole map.",
         ),
     ] = None,
+    figures: FiguresOption = PictureFormat.PNG,
     *,
     force: ForceOption = False,
     strict: Annotated[
@@ -162,7 +165,14 @@ def process(
     for log, folder in zip(logs, folders, strict=True):
         try:
             report = _processed(
-                log, folder, map_file, settings, start=start, force=force, quiet=quiet or as_json
+                log,
+                folder,
+                map_file,
+                settings,
+                start=start,
+                figures=figures,
+                force=force,
+                quiet=quiet or as_json,
             )
             outcomes.append({**report, "folder": str(folder)})
         except SoundmapError as error:
@@ -235,6 +245,7 @@ def _processed(
     config: Config,
     *,
     start: tuple[float, float, float] | None,
+    figures: PictureFormat,
     force: bool,
     quiet: bool,
 ) -> dict[str, Any]:
@@ -249,7 +260,7 @@ def _processed(
         run = processed(
             log, map_file, config, start_pose=start, progress=chosen_progress(quiet=quiet)
         )
-        return write_run(run, new)
+        return write_run(run, new, figures=figures)
 
 
 def _run_folders(logs: list[Path], out: Path | None) -> list[Path]:

@@ -8,8 +8,10 @@ from typing import Annotated
 
 import typer
 
+from soundmap.outputs.picture_format import PictureFormat
 from soundmap.terminal import (
     ConfigOption,
+    FiguresOption,
     ForceOption,
     JsonOption,
     QuietOption,
@@ -33,6 +35,7 @@ def diff(
         ),
     ] = None,
     config: ConfigOption = None,
+    figures: FiguresOption = PictureFormat.PNG,
     *,
     force: ForceOption = False,
     quiet: QuietOption = False,
@@ -62,6 +65,7 @@ def diff(
             background=background,
             config=settings.diff,
             timings_s=timings_s,
+            figures=figures,
         )
     if not quiet or as_json:
         print_result({**report, "folder": str(folder)}, diff_view, as_json=as_json)

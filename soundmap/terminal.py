@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from soundmap.errors import SoundmapError
+from soundmap.outputs.picture_format import PictureFormat
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -31,6 +32,14 @@ ForceOption = Annotated[
         "--force",
         help="Replace the folder of an earlier run, with all that is in it, once the new one is "
         "complete. Without it, a folder that is not empty is refused.",
+    ),
+]
+FiguresOption = Annotated[
+    PictureFormat,
+    typer.Option(
+        "--figures",
+        metavar="FORMAT",
+        help="Format of the pictures: png, pdf, svg, or none for no pictures.",
     ),
 ]
 QuietOption = Annotated[

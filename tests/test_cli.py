@@ -15,7 +15,7 @@ from handmade import made_ratio, made_run, walled_room
 from typer.testing import CliRunner
 
 import soundmap.logs.summary
-import soundmap.outputs.figures
+import soundmap.outputs.pictures
 import soundmap.replay
 from soundmap import __version__
 from soundmap.cli import app
@@ -32,7 +32,7 @@ def invoked(*arguments: object):
 @pytest.fixture
 def _no_pictures(monkeypatch):
     """Pictures take a second a run and are tested elsewhere."""
-    monkeypatch.setattr(soundmap.outputs.figures, "write_png", lambda _figure, file: file.touch())
+    monkeypatch.setattr(soundmap.outputs.pictures, "picture_bytes", lambda *_: b"")
 
 
 @pytest.fixture
@@ -135,6 +135,21 @@ def test_an_error_leaves_the_standard_output_empty(processed):
     assert result.stdout == ""
     assert result.stderr == "soundmap: error: silent.mcap: no audio.\n"
     assert list(Path().iterdir()) == []
+
+
+@pytest.mark.parametrize(("chosen", "ending"), [("svg", ".svg"), ("pdf", ".pdf"), ("png", ".png")])
+def test_pictures_come_in_the_format_asked_for(processed, chosen, ending):
+    assert invoked("process", "a.mcap", "--map", "m.yaml", "--figures", chosen).exit_code == 0
+    pictures = {path.suffix for path in Path("a").iterdir() if path.stem == "power_map"}
+    assert pictures == {ending, ".npz"}
+
+
+def test_without_pictures_there_are_none(processed):
+    assert invoked("process", "a.mcap", "--map", "m.yaml", "--figures", "none").exit_code == 0
+    assert not list(Path("a").glob("*.png"))
+    result = invoked("process", "b.mcap", "--map", "m.yaml", "--figures", "jpeg")
+    assert result.exit_code == 2
+    assert "'png', 'pdf', 'svg', 'none'" in result.stderr
 
 
 def test_quiet_prints_nothing_when_all_is_well(processed):

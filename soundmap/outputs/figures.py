@@ -1,38 +1,28 @@
-"""Pictures of a run: what a person looks at first. Figs. 2, 6 and 7 of the paper."""
+"""Pictures of places: what a person looks at first. Figs. 2, 6 and 7 of the paper."""
 
 from __future__ import annotations
 
-import warnings
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from soundmap.geometry import FloatArray, Trajectory, wrapped_angle
+from soundmap.geometry import FloatArray, Trajectory
 from soundmap.grid import GridFrame, OccupancyGrid
-from soundmap.outputs.floor import (
-    area_of_interest,
-    cropped,
-    draw_places,
-    draw_wall_outlines,
-    floor_plan,
-)
+from soundmap.outputs.floor import FloorPlan, area_of_interest
 from soundmap.run import Run
-from soundmap.sound import AudioScans, LevelReference, PowerMap, PowerRatio, decibels
+from soundmap.sound import PowerRatio, decibels
 
 # Okabe and Ito's colours, told apart with any kind of colour vision.
 BLUE, VERMILION, GREEN = "#0072B2", "#D55E00", "#009E73"
 SHOWN_RANGE_DB = 30.0
 LEAST_RATIO_DB, GREATEST_RATIO_DB = 3.0, 20.0
 ARROWS = 10
-DOTS_PER_INCH = 120
-AUDIO_COLUMNS = 1200
-BESIDE = (1.02, 0.0, 0.03, 1.0)
-"""Place of a colour bar as tall as the axes, in their own coordinates."""
+
+Places = Sequence[tuple[float, float]]
 
 
 def trajectory_figure(run: Run) -> Figure:
@@ -40,26 +30,30 @@ def trajectory_figure(run: Run) -> Figure:
     trajectory = run.trajectory
     places = [(source.x_m, source.y_m) for source in run.sources]
     area = area_of_interest([trajectory.pose[:, :2], _points(places)], run.room)
-    figure, axes = floor_plan(area, run.room, f"{run.log.stem}: geometric map and trajectory")
-    _draw_trajectory(axes, trajectory)
-    draw_places(axes, places, area)
-    _add_legend(figure, axes)
-    return figure
+    plan = FloorPlan(area, run.room, f"{run.log.stem}: geometric map and trajectory")
+    _draw_trajectory(plan.axes, trajectory)
+    plan.draw_places(places)
+    return plan.finished()
 
 
-def power_map_figure(run: Run) -> Figure:
-    """Fig. 6: power map in dB over the geometric map, with its local maxima."""
+def power_map_figure(run: Run, *, truth: Places = ()) -> Figure:
+    """Fig. 6: power map in dB over the geometric map, with its local maxima.
+
+    Parameters
+    ----------
+    run : Run
+    truth : sequence of tuple
+        Where the sources truly are, if known: x, y [m].
+    """
     power_map, share = run.power_map, run.config.detect.min_visit_share
     level = decibels(power_map.power(min_visit_share=share))
     places = [(source.x_m, source.y_m) for source in run.sources]
-    area = area_of_interest(
-        [_measured_points(level, power_map.frame), run.trajectory.pose[:, :2], _points(places)],
-        run.room,
-    )
-    figure, axes = floor_plan(area, run.room, f"{run.log.stem}: power map")
-    low, high = _shown_range(level)
-    part, extent = cropped(_not_below(level, low), power_map.frame, area)
-    image = axes.imshow(
+    seen = [_measured_points(level, power_map.frame), run.trajectory.pose[:, :2]]
+    area = area_of_interest([*seen, _points(places), _points(truth)], run.room)
+    plan = FloorPlan(area, run.room, f"{run.log.stem}: power map")
+    low, high = shown_range(level)
+    part, extent = plan.blocks(not_below(level, low), power_map.frame, _greatest)
+    image = plan.axes.imshow(
         part,
         origin="lower",
         extent=extent,
@@ -69,20 +63,15 @@ def power_map_figure(run: Run) -> Figure:
         interpolation="nearest",
     )
     if np.isnan(level).all():
-        _say_nothing_measured(axes)
+        say_nothing_measured(plan.axes)
     else:
-        below = bool(np.any(level < low))
-        figure.colorbar(
-            image,
-            cax=axes.inset_axes(BESIDE),
-            label=f"mean emitted power [{_written(power_map)}]",
-            extend="min" if below else "neither",
-        )
-    draw_wall_outlines(axes, run.room, area)
-    axes.plot(*run.trajectory.pose[:, :2].T, color="0.45", linewidth=0.8, label="trajectory")
-    draw_places(axes, places, area)
-    _add_legend(figure, axes)
-    return figure
+        label = f"mean emitted power{_blocks(plan, power_map.frame)} [{written(power_map)}]"
+        plan.add_colour_bar(image, label, "min" if np.any(level < low) else "neither")
+    plan.draw_wall_outlines()
+    plan.axes.plot(*run.trajectory.pose[:, :2].T, color="0.45", linewidth=0.8, label="trajectory")
+    plan.draw_places(places)
+    plan.draw_truth(truth)
+    return plan.finished()
 
 
 def power_ratio_figure(ratio: PowerRatio, *, room: OccupancyGrid | None, title: str) -> Figure:
@@ -90,11 +79,11 @@ def power_ratio_figure(ratio: PowerRatio, *, room: OccupancyGrid | None, title: 
     level = ratio.ratio_db
     places = [(change.x_m, change.y_m) for change in ratio.changes]
     area = area_of_interest([_measured_points(level, ratio.frame), _points(places)], room)
-    figure, axes = floor_plan(area, room, f"{title}: difference of power maps", dimmed=True)
+    plan = FloorPlan(area, room, f"{title}: difference of power maps", dimmed=True)
     finite = np.abs(level[np.isfinite(level)])
     reach = float(np.clip(finite.max(initial=0.0), LEAST_RATIO_DB, GREATEST_RATIO_DB))
-    part, extent = cropped(level, ratio.frame, area)
-    image = axes.imshow(
+    part, extent = plan.blocks(level, ratio.frame, _farthest_from_zero)
+    image = plan.axes.imshow(
         np.clip(part.astype(np.float64), -reach, reach),
         origin="lower",
         extent=extent,
@@ -104,82 +93,69 @@ def power_ratio_figure(ratio: PowerRatio, *, room: OccupancyGrid | None, title: 
         interpolation="nearest",
     )
     if np.isnan(level).all():
-        _say_nothing_measured(axes)
+        say_nothing_measured(plan.axes)
     else:
-        bar = figure.colorbar(image, cax=axes.inset_axes(BESIDE), extend=_open_ends(level, reach))
-        bar.set_label("power of the run over that of the background [dB]")
+        plan.add_colour_bar(image, "louder than the background by [dB]", _open_ends(level, reach))
     without = np.argwhere(np.isfinite(level) & ~ratio.background_measured)
     if len(without):
-        axes.plot(
+        plan.axes.plot(
             *ratio.frame.centres(without).T,
             linestyle="none",
             marker=".",
             markersize=2.0,
             color="black",
-            label="not measured in the background: against its median",
+            label="against the background's median",
         )
-    if room is not None:
-        draw_wall_outlines(axes, room, area)
-    draw_places(axes, places, area)
-    _add_legend(figure, axes)
-    return figure
+    plan.draw_wall_outlines()
+    plan.draw_places(places)
+    return plan.finished()
 
 
-def audio_scan_figure(run: Run) -> Figure:
-    """Level on every bearing over time, as the array heard it (Sect. 2.3)."""
-    scans = run.scans
-    figure = Figure(figsize=(10.0, 4.2), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    axes.set_xlabel("time since the first audio scan [s]")
-    axes.set_ylabel("bearing in the array's frame [degrees]")
-    axes.set_title(f"{run.log.stem}: audio scans", parse_math=False)
-    axes.set_ylim(-180.0, 180.0)
-    axes.set_yticks(np.arange(-180, 181, 45))
-    if len(scans) == 0:
-        _say_nothing_measured(axes)
-    else:
-        times_s, power = _columns_in_time(scans)
-        angle = np.degrees(wrapped_angle(scans.bearing_rad))
-        order = np.argsort(angle, kind="stable")
-        level = decibels(power[:, order]).T
-        low, high = _shown_range(level)
-        half = 180.0 / len(angle)
-        image = axes.imshow(
-            _not_below(level, low),
-            origin="lower",
-            aspect="auto",
-            extent=(0.0, times_s, angle[order[0]] - half, angle[order[-1]] + half),
-            cmap="viridis",
-            vmin=low,
-            vmax=high,
-            interpolation="nearest",
-        )
-        figure.colorbar(image, ax=axes, label=f"power [{_written(scans)}]")
-    return figure
+def shown_range(level: FloatArray) -> tuple[float, float]:
+    """Least and greatest level of the colours [dB]: all there is, within limits."""
+    finite = level[np.isfinite(level)]
+    if not len(finite):
+        return -1.0, 0.0
+    high = float(finite.max())
+    return min(max(float(finite.min()), high - SHOWN_RANGE_DB), high - 1.0), high
 
 
-def write_png(figure: Figure, file: Path) -> None:
-    """Write a picture; equal pictures give equal bytes."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a log's name may hold letters that the font lacks
-        figure.savefig(file, format="png", dpi=DOTS_PER_INCH, bbox_inches="tight")
+def not_below(level: FloatArray, low: float) -> FloatArray:
+    """Silent cells (-inf) drawn as the lowest colour; unmeasured ones (NaN) left out."""
+    return np.where(np.isnan(level), np.nan, np.maximum(level, low))
+
+
+def written(levels: Any) -> str:
+    """The reference of the levels of a power map, of audio scans or of sources, in print."""
+    return str(levels.reference).replace("^2", "²").replace("uPa", "µPa")
+
+
+def say_nothing_measured(axes: Axes) -> None:
+    """Words in the middle of an empty picture."""
+    axes.text(
+        0.5,
+        0.5,
+        "nothing measured",
+        transform=axes.transAxes,
+        ha="center",
+        va="center",
+        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8},
+    )
 
 
 def _draw_trajectory(axes: Axes, trajectory: Trajectory) -> None:
     if len(trajectory) == 0:
-        _say_nothing_measured(axes)
+        say_nothing_measured(axes)
         return
     points = trajectory.pose[:, :2]
-    pieces = np.stack([points[:-1], points[1:]], axis=1)
-    sound = trajectory.usable[:-1] & trajectory.usable[1:]
+    trusted = trajectory.usable[:-1] & trajectory.usable[1:]
     axes.add_collection(
-        LineCollection(list(pieces[sound]), colors=BLUE, linewidths=1.8, label="trajectory")
+        LineCollection(_stretches(points, trusted), colors=BLUE, linewidths=1.8, label="trajectory")
     )
-    if not sound.all() or not trajectory.usable.all():
+    if not trusted.all() or not trajectory.usable.all():
         axes.add_collection(
             LineCollection(
-                list(pieces[~sound]),
+                _stretches(points, ~trusted),
                 colors=VERMILION,
                 linewidths=3.5,
                 capstyle="round",
@@ -191,10 +167,17 @@ def _draw_trajectory(axes: Axes, trajectory: Trajectory) -> None:
             "",
             xy=tuple(tip),
             xytext=tuple(tail),
-            arrowprops={"arrowstyle": "-|>", "color": BLUE, "mutation_scale": 16},
+            arrowprops={"arrowstyle": "-|>", "color": BLUE, "mutation_scale": 14},
         )
-    axes.plot(*points[0], "o", color=GREEN, markersize=9, linestyle="none", label="start")
-    axes.plot(*points[-1], "s", color="black", markersize=8, linestyle="none", label="end")
+    axes.plot(*points[0], "o", color=GREEN, markersize=8, linestyle="none", label="start")
+    axes.plot(*points[-1], "s", color="black", markersize=7, linestyle="none", label="end")
+
+
+def _stretches(points: FloatArray, wanted: Any) -> list[FloatArray]:
+    """Unbroken parts of a way whose steps are wanted; ``wanted`` has one flag a step."""
+    edges = np.diff(np.concatenate([[0], wanted.astype(np.int8), [0]]))
+    starts, ends = np.flatnonzero(edges > 0), np.flatnonzero(edges < 0)
+    return [points[start : end + 1] for start, end in zip(starts, ends, strict=True)]
 
 
 def _direction_arrows(points: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
@@ -209,36 +192,25 @@ def _direction_arrows(points: FloatArray) -> list[tuple[FloatArray, FloatArray]]
     return arrows
 
 
-def _columns_in_time(scans: AudioScans) -> tuple[float, FloatArray]:
-    """Total time [s] and mean power in equal steps of it, shape (steps, N); NaN in gaps."""
-    since = (scans.time_ns - scans.time_ns[0]) * 1e-9
-    typical = float(np.median(np.diff(since))) if len(scans) > 1 else 0.1
-    total = float(since[-1]) + typical
-    steps = int(np.clip(round(total / typical), 1, AUDIO_COLUMNS))
-    column = np.minimum((since / total * steps + 1e-6).astype(np.int64), steps - 1)
-    power = np.full((steps, len(scans.bearing_rad)), np.nan)
-    starts = np.flatnonzero(np.diff(column, prepend=-1))
-    counts = np.diff(starts, append=len(column))
-    sums = np.add.reduceat(scans.power.astype(np.float64), starts, axis=0)
-    power[column[starts]] = sums / counts[:, None]
-    return total, power
+def _greatest(values: FloatArray, axis: int) -> FloatArray:
+    """The greatest along an axis; NaN only where all are."""
+    return np.asarray(np.fmax.reduce(values, axis=axis))
 
 
-def _shown_range(level: FloatArray) -> tuple[float, float]:
-    """Least and greatest level of the colours [dB]: all there is, within limits."""
-    finite = level[np.isfinite(level)]
-    if not len(finite):
-        return -1.0, 0.0
-    high = float(finite.max())
-    return min(max(float(finite.min()), high - SHOWN_RANGE_DB), high - 1.0), high
+def _farthest_from_zero(values: FloatArray, axis: int) -> FloatArray:
+    """What differs most from zero along an axis; NaN only where all are."""
+    high = np.asarray(np.fmax.reduce(values, axis=axis))
+    low = np.asarray(np.fmin.reduce(values, axis=axis))
+    return np.asarray(np.where(high >= -low, high, low))
 
 
-def _not_below(level: FloatArray, low: float) -> FloatArray:
-    """Silent cells (-inf) drawn as the lowest colour; unmeasured ones (NaN) left out."""
-    return np.where(np.isnan(level), np.nan, np.maximum(level, low))
+def _blocks(plan: FloorPlan, frame: GridFrame) -> str:
+    """How much one square of the picture stands for, if it is more than a cell."""
+    edge = plan.block_m(frame)
+    return "" if edge <= frame.resolution_m else f", greatest of each {edge:.3g} m"
 
 
-def _open_ends(level: FloatArray, reach: float) -> Any:
+def _open_ends(level: FloatArray, reach: float) -> str:
     above, below = bool(np.any(level > reach)), bool(np.any(level < -reach))
     return {(True, True): "both", (True, False): "max", (False, True): "min"}.get(
         (above, below), "neither"
@@ -249,20 +221,5 @@ def _measured_points(level: FloatArray, frame: GridFrame) -> FloatArray:
     return frame.centres(np.argwhere(~np.isnan(level)))
 
 
-def _points(places: list[tuple[float, float]]) -> FloatArray:
+def _points(places: Places) -> FloatArray:
     return np.array(places, dtype=np.float64).reshape(-1, 2)
-
-
-def _written(levels: PowerMap | AudioScans) -> str:
-    reference: LevelReference = levels.reference
-    return str(reference).replace("^2", "²").replace("uPa", "µPa")
-
-
-def _say_nothing_measured(axes: Axes) -> None:
-    axes.text(0.5, 0.5, "nothing measured", transform=axes.transAxes, ha="center", va="center")
-
-
-def _add_legend(figure: Figure, axes: Axes) -> None:
-    handles, labels = axes.get_legend_handles_labels()
-    if handles:
-        figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False)

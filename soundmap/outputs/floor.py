@@ -1,28 +1,43 @@
-"""The floor plan that every picture of a place is drawn on: size, walls, metres, labels."""
+"""The floor plan that every picture of a place is drawn on: size, walls, metres, colour bar."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib import patheffects
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 
 from soundmap.geometry import FloatArray
 from soundmap.grid import GridFrame, OccupancyGrid
+from soundmap.outputs.labels import label_offsets
 
 WALL, UNKNOWN, OPEN = 0.25, 0.90, 1.0
 DIMMED_UNKNOWN, DIMMED_OPEN = 0.80, 0.90
 """Grey values of the geometric map, 0 black to 1 white."""
 
-MARGIN_M = 0.75
+MARGIN_M, MARGIN_SHARE = 0.75, 0.04
 LEAST_SIDE_M = 2.0
 GREATEST_ASPECT = 4.0
-LONG_SIDE_INCHES = 8.0
+LONG_SIDE_INCHES = 6.2
+DOTS_PER_INCH = 160
+LEAST_CELL_DOTS = 3.0
+"""Cells smaller than this in the picture are drawn in blocks, so that none is skipped."""
+
+LEFT, RIGHT, TOP, BOTTOM = 0.75, 0.25, 0.40, 0.55
+"""Room around the axes for what is written there [inches]."""
+BAR_GAP, BAR_WIDTH, BAR_TEXT = 0.12, 0.18, 0.75
+BAR_LABEL_INCHES = 3.9
+LEGEND_ROW, LEGEND_ENTRY = 0.26, 1.35
+LEAST_WIDTH_INCHES = 5.0
+CIRCLE_POINTS = 15.0
+TRUTH = "#D55E00"
 
 
 @dataclass(frozen=True)
@@ -70,17 +85,19 @@ def area_of_interest(points_m: Iterable[FloatArray], room: OccupancyGrid | None)
             around = max(2.0, 0.1 * float(np.max(high - low)))
             low = np.minimum(low, np.maximum(low - around, known[0]))
             high = np.maximum(high, np.minimum(high + around, known[1]))
-    low, high = low - MARGIN_M, high + MARGIN_M
+    margin = max(MARGIN_M, MARGIN_SHARE * float(np.max(high - low)))
+    low, high = low - margin, high + margin
     side = np.maximum(high - low, LEAST_SIDE_M)
     side = np.maximum(side, side.max() / GREATEST_ASPECT)
     left, bottom = (low + high - side) / 2.0
     return Area(float(left), float(left + side[0]), float(bottom), float(bottom + side[1]))
 
 
-def floor_plan(
-    area: Area, room: OccupancyGrid | None, title: str, *, dimmed: bool = False
-) -> tuple[Figure, Axes]:
-    """A figure of a size that suits the area, with the geometric map and metres on its axes.
+class FloorPlan:
+    """A picture of an area, with the geometric map and metres on its axes.
+
+    Everything is placed in inches: the axes have the area's shape, and what is written around
+    them has its own room, whatever the site's proportions.
 
     Parameters
     ----------
@@ -90,38 +107,181 @@ def floor_plan(
     dimmed : bool
         Keep white for the data: open space is grey, too.
     """
-    unknown, free = (DIMMED_UNKNOWN, DIMMED_OPEN) if dimmed else (UNKNOWN, OPEN)
-    scale = LONG_SIDE_INCHES / max(area.width, area.height)
-    figure = Figure(
-        figsize=(max(area.width * scale, 4.0) + 1.8, area.height * scale + 1.3),
-        layout="constrained",
-    )
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    axes.set_facecolor(str(unknown))
-    if room is not None:
-        shade = np.full(room.frame.shape, unknown, dtype=np.float32)
-        shade[room.free], shade[room.occupied] = free, WALL
-        part, extent = cropped(shade, room.frame, area)
-        axes.imshow(part, origin="lower", extent=extent, cmap="gray", vmin=0, vmax=1)
-    axes.set_aspect("equal")
-    axes.set_xlim(area.left, area.right)
-    axes.set_ylim(area.bottom, area.top)
-    axes.set_xlabel("x [m]")
-    axes.set_ylabel("y [m]")
-    axes.set_title(title, parse_math=False)
-    return figure, axes
 
+    def __init__(
+        self, area: Area, room: OccupancyGrid | None, title: str, *, dimmed: bool = False
+    ) -> None:
+        unknown, free = (DIMMED_UNKNOWN, DIMMED_OPEN) if dimmed else (UNKNOWN, OPEN)
+        self.area, self.room = area, room
+        self.scale = LONG_SIDE_INCHES / max(area.width, area.height)
+        self.figure = Figure(dpi=DOTS_PER_INCH)
+        FigureCanvasAgg(self.figure)
+        self.axes: Axes = self.figure.add_axes((0.1, 0.1, 0.8, 0.8))
+        self._title = title
+        self._bar: Axes | None = None
+        self.axes.set_facecolor(str(unknown))
+        if room is not None:
+            shade = np.full(room.frame.shape, unknown, dtype=np.float32)
+            shade[room.free], shade[room.occupied] = free, WALL
+            part, extent = self.blocks(shade, room.frame, np.min)
+            self.axes.imshow(part, origin="lower", extent=extent, cmap="gray", vmin=0, vmax=1)
+        self.axes.set_aspect("equal")
+        self.axes.set_xlim(area.left, area.right)
+        self.axes.set_ylim(area.bottom, area.top)
+        self.axes.set_xlabel("x [m]")
+        self.axes.set_ylabel("y [m]")
 
-def draw_wall_outlines(axes: Axes, room: OccupancyGrid, area: Area) -> None:
-    """Thin lines round the walls, over whatever colours lie on them."""
-    part, (left, right, bottom, top) = cropped(room.occupied, room.frame, area)
-    if min(part.shape) < 2 or not part.any() or part.all():
-        return
-    half = room.frame.resolution_m / 2.0
-    x = np.linspace(left + half, right - half, part.shape[1])
-    y = np.linspace(bottom + half, top - half, part.shape[0])
-    axes.contour(x, y, part.astype(np.float32), [0.5], colors=[str(WALL)], linewidths=0.7)
+    def block_m(self, frame: GridFrame) -> float:
+        """Edge of what is drawn as one square: a cell, or as many as a picture can show [m]."""
+        return self._cells_a_block(frame) * frame.resolution_m
+
+    def blocks(
+        self, values: NDArray[np.generic], frame: GridFrame, reduce: Any
+    ) -> tuple[FloatArray, tuple[float, float, float, float]]:
+        """The cells in the area in drawable blocks, and the edges of what they cover [m].
+
+        Parameters
+        ----------
+        values : ndarray, shape (H, W)
+        frame : GridFrame
+        reduce : callable
+            What stands for a block, as ``np.max`` does; called with ``axis``.
+        """
+        part, extent = cropped(values, frame, self.area)
+        return coarsened(part, extent, self._cells_a_block(frame), reduce)
+
+    def add_colour_bar(self, image: AxesImage, label: str, extend: str) -> None:
+        """A bar beside the axes; below them where they are too low for its label."""
+        axes = self.figure.add_axes((0.9, 0.1, 0.05, 0.8))
+        self._bar = axes
+        upright = self._height >= BAR_LABEL_INCHES
+        bar = self.figure.colorbar(
+            image,
+            cax=axes,
+            orientation="vertical" if upright else "horizontal",
+            extend=extend,
+        )
+        bar.set_label(label, fontsize=9)
+
+    def draw_wall_outlines(self) -> None:
+        """Thin lines round the walls, over whatever colours lie on them."""
+        if self.room is None:
+            return
+        part, (left, right, bottom, top) = self.blocks(self.room.occupied, self.room.frame, np.max)
+        if min(part.shape) < 2 or not part.any() or part.all():
+            return
+        x = left + (np.arange(part.shape[1]) + 0.5) * (right - left) / part.shape[1]
+        y = bottom + (np.arange(part.shape[0]) + 0.5) * (top - bottom) / part.shape[0]
+        self.axes.contour(x, y, part.astype(np.float32), [0.5], colors=[str(WALL)], linewidths=0.7)
+
+    def draw_places(self, places_m: Sequence[tuple[float, float]]) -> None:
+        """Circles labelled S1, S2, ... in the order given; crowded ones go without a label."""
+        if not places_m:
+            return
+        points = (np.array(places_m) - [self.area.left, self.area.bottom]) * self.scale * 72.0
+        names = [f"S{number}" for number in range(1, len(places_m) + 1)]
+        size = (self.area.width * self.scale * 72.0, self.area.height * self.scale * 72.0)
+        offsets = label_offsets(points, names, size, marker=CIRCLE_POINTS)
+        some = any(offset is None for offset in offsets)
+        self._mark(places_m, "o", "black", "local maxima (some unlabelled)" if some else "")
+        for place, name, offset in zip(places_m, names, offsets, strict=True):
+            if offset is not None:
+                text = self.axes.annotate(
+                    name,
+                    place,
+                    xytext=offset,
+                    textcoords="offset points",
+                    ha="center",
+                    va="center",
+                    weight="bold",
+                    fontsize=9,
+                    zorder=6,
+                )
+                text.set_path_effects(_halo())
+
+    def draw_truth(self, places_m: Sequence[tuple[float, float]]) -> None:
+        """Crosses where the sources truly are."""
+        if places_m:
+            self._mark(places_m, "x", TRUTH, "truth", size=9.0)
+
+    def finished(self) -> Figure:
+        """The figure with everything in its place."""
+        width, height = self.area.width * self.scale, self._height
+        handles, labels = self.axes.get_legend_handles_labels()
+        beside = self._bar is not None and height >= BAR_LABEL_INCHES
+        below = self._bar is not None and not beside
+        right = RIGHT + (BAR_GAP + BAR_WIDTH + BAR_TEXT if beside else 0.0)
+        total_width = max(LEFT + width + right, LEAST_WIDTH_INCHES)
+        columns = max(1, min(len(labels), int((total_width - 0.2) / LEGEND_ENTRY)))
+        rows = -(-len(labels) // columns)
+        bottom = BOTTOM + LEGEND_ROW * rows + (0.1 if rows else 0.0)
+        bar_bottom = bottom - 0.05
+        bottom += BAR_WIDTH + 0.55 if below else 0.0
+        total_height = bottom + height + TOP
+        self.figure.set_size_inches(total_width, total_height)
+        left = LEFT + (total_width - LEFT - width - right) / 2.0
+
+        def place(x: float, y: float, w: float, h: float) -> tuple[float, float, float, float]:
+            return x / total_width, y / total_height, w / total_width, h / total_height
+
+        self.axes.set_position(place(left, bottom, width, height))
+        if self._bar is not None and beside:
+            self._bar.set_position(place(left + width + BAR_GAP, bottom, BAR_WIDTH, height))
+        elif self._bar is not None:
+            self._bar.set_position(place(left, bar_bottom, width, BAR_WIDTH))
+        self.figure.text(
+            0.5,
+            1.0 - 0.14 / total_height,
+            shortened(self._title, int(total_width * 10.5)),
+            ha="center",
+            va="top",
+            fontsize=11,
+            parse_math=False,
+        )
+        if labels:
+            self.figure.legend(
+                handles,
+                labels,
+                loc="lower center",
+                ncols=columns,
+                frameon=False,
+                fontsize=9,
+                borderaxespad=0.45,
+                handletextpad=0.5,
+                columnspacing=1.2,
+            )
+        return self.figure
+
+    @property
+    def _height(self) -> float:
+        return self.area.height * self.scale
+
+    def _cells_a_block(self, frame: GridFrame) -> int:
+        dots = frame.resolution_m * self.scale * DOTS_PER_INCH
+        return max(1, int(np.ceil(LEAST_CELL_DOTS / dots - 1e-9)))
+
+    def _mark(
+        self,
+        places_m: Sequence[tuple[float, float]],
+        marker: str,
+        colour: str,
+        label: str,
+        size: float = CIRCLE_POINTS,
+    ) -> None:
+        x, y = np.array(places_m).T
+        self.axes.plot(
+            x,
+            y,
+            linestyle="none",
+            marker=marker,
+            markersize=size,
+            markerfacecolor="none",
+            markeredgecolor=colour,
+            markeredgewidth=1.4,
+            path_effects=_halo(),
+            label=label or "local maxima",
+            zorder=5,
+        )
 
 
 def cropped(
@@ -139,38 +299,47 @@ def cropped(
     return part, (left, right, y + first_row * step, y + last_row * step)
 
 
-def draw_places(axes: Axes, places_m: Sequence[tuple[float, float]], area: Area) -> None:
-    """Circles labelled S1, S2, ... in the order given, the labels inside the area."""
-    if not places_m:
-        return
-    x, y = np.array(places_m).T
-    outline: list[patheffects.AbstractPathEffect] = [
-        patheffects.withStroke(linewidth=2.5, foreground="white")
-    ]
-    axes.plot(
-        x,
-        y,
-        linestyle="none",
-        marker="o",
-        markersize=11,
-        markerfacecolor="none",
-        markeredgecolor="black",
-        markeredgewidth=1.6,
-        path_effects=outline,
-        label="local maxima",
-    )
-    for number, place in enumerate(places_m, start=1):
-        at_right_edge = place[0] > area.right - 0.06 * area.width
-        at_top = place[1] > area.top - 0.06 * area.height
-        text = axes.annotate(
-            f"S{number}",
-            place,
-            xytext=(-7 if at_right_edge else 7, -16 if at_top else 7),
-            textcoords="offset points",
-            horizontalalignment="right" if at_right_edge else "left",
-            weight="bold",
-        )
-        text.set_path_effects(outline)
+def coarsened(
+    values: NDArray[np.generic],
+    extent: tuple[float, float, float, float],
+    block: int,
+    reduce: Any,
+) -> tuple[Any, tuple[float, float, float, float]]:
+    """Blocks of ``block`` x ``block`` cells, and the edges of what they cover [m].
+
+    Examples
+    --------
+    >>> coarsened(np.array([[1, 2, 3]]), (0.0, 3.0, 0.0, 1.0), 2, np.max)
+    (array([[2, 3]]), (0.0, 4.0, 0.0, 2.0))
+    """
+    if block == 1:
+        return values, extent
+    rows, columns = values.shape
+    tall, wide = -rows % block, -columns % block
+    left, right, bottom, top = extent
+    step = (right - left) / columns
+    full = np.pad(values, ((0, tall), (0, wide)), mode="edge")
+    cut = full.reshape(full.shape[0] // block, block, full.shape[1] // block, block)
+    grown = (left, right + wide * step, bottom, top + tall * step)
+    return reduce(reduce(cut, axis=3), axis=1), grown
+
+
+def shortened(text: str, most: int) -> str:
+    """Text of no more than ``most`` characters, its middle left out where there are more.
+
+    Examples
+    --------
+    >>> shortened("a very long name: power map", 15)
+    'a very…ower map'
+    """
+    if len(text) <= most:
+        return text
+    start = (most - 1) * 3 // 7
+    return f"{text[:start]}…{text[len(text) - (most - 1 - start) :]}"
+
+
+def _halo() -> list[patheffects.AbstractPathEffect]:
+    return [patheffects.withStroke(linewidth=2.5, foreground="white")]
 
 
 def _span(start_m: float, end_m: float, step: float, count: int) -> tuple[int, int]:

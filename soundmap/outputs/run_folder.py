@@ -6,6 +6,7 @@ import time
 import zipfile
 import zlib
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,8 @@ from soundmap.geometry import FloatArray, Trajectory
 from soundmap.grid import GridFrame, OccupancyGrid
 from soundmap.map_file import map_files
 from soundmap.outputs.new_folder import REPORT, writing
+from soundmap.outputs.picture_format import PictureFormat
+from soundmap.outputs.pictures import difference_pictures, run_pictures, write_pictures
 from soundmap.outputs.report import (
     CHANGE_COLUMNS,
     SCHEMA_VERSION,
@@ -33,16 +36,23 @@ from soundmap.sound import AudioScans, LevelReference, PowerMap, PowerRatio
 POWER_MAP = "power_map.npz"
 
 
-def write_run(run: Run, folder: Path) -> dict[str, Any]:
+def write_run(
+    run: Run, folder: Path, *, figures: PictureFormat = PictureFormat.PNG
+) -> dict[str, Any]:
     """Write everything that a run yields into an empty folder.
+
+    Parameters
+    ----------
+    run : Run
+    folder : Path
+    figures : PictureFormat
+        How to write the pictures, if at all.
 
     Returns
     -------
     dict
         The report, as in ``report.json``.
     """
-    from soundmap.outputs import figures  # matplotlib is slow to load
-
     start = time.perf_counter()
     share = run.config.detect.min_visit_share
     with writing(folder):
@@ -51,9 +61,7 @@ def write_run(run: Run, folder: Path) -> dict[str, Any]:
         write_arrays(folder / "audio_scans.npz", _audio_scan_arrays(run.scans))
         _write_map(folder, run.room)
         (folder / "config.toml").write_text(config_toml(run.config), encoding="utf-8")
-        figures.write_png(figures.trajectory_figure(run), folder / "trajectory.png")
-        figures.write_png(figures.power_map_figure(run), folder / "power_map.png")
-        figures.write_png(figures.audio_scan_figure(run), folder / "audio_scans.png")
+        write_pictures(partial(run_pictures, run), folder, figures)
         report = run_report(run, {**run.timings_s, "outputs": time.perf_counter() - start})
         _write_tables(folder, SOURCE_COLUMNS, report)
     return report
@@ -68,6 +76,7 @@ def write_diff(
     background: Path,
     config: DiffConfig,
     timings_s: Mapping[str, float],
+    figures: PictureFormat = PictureFormat.PNG,
 ) -> dict[str, Any]:
     """Write the difference of two runs into an empty folder.
 
@@ -82,22 +91,22 @@ def write_diff(
     config : DiffConfig
     timings_s : mapping
         Wall time of each stage so far [s].
+    figures : PictureFormat
+        How to write the picture, if at all.
 
     Returns
     -------
     dict
         The report, as in ``report.json``.
     """
-    from soundmap.outputs import figures
-
     start = time.perf_counter()
     with writing(folder):
         write_arrays(folder / "power_ratio.npz", _power_ratio_arrays(ratio))
         if room is not None:
             _write_map(folder, room)
         title = f"{run.resolve().name} against {background.resolve().name}"
-        figure = figures.power_ratio_figure(ratio, room=room, title=title)
-        figures.write_png(figure, folder / "power_ratio.png")
+        pictures = partial(difference_pictures, ratio, room=room, title=title)
+        write_pictures(pictures, folder, figures)
         report = diff_report(
             ratio,
             run=run,

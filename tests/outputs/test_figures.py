@@ -1,21 +1,18 @@
+import io
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from handmade import START_NS, made_ratio, made_run, round_trip, unlucky_run, walled_room
+from handmade import heard_map, made_ratio, made_run, round_trip, unlucky_run, walled_room
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage, imread
 
 from soundmap.grid import GridFrame
-from soundmap.outputs.figures import (
-    audio_scan_figure,
-    power_map_figure,
-    power_ratio_figure,
-    trajectory_figure,
-    write_png,
-)
+from soundmap.outputs.figures import power_map_figure, power_ratio_figure, trajectory_figure
 from soundmap.outputs.floor import Area, area_of_interest, cropped
-from soundmap.sound import AudioScans, LevelReference, PowerMap, SourceList
+from soundmap.outputs.picture_format import PictureFormat
+from soundmap.outputs.pictures import picture_bytes
+from soundmap.sound import LevelReference, PowerMap, Source, SourceList
 
 
 def texts(figure: Figure) -> set[str]:
@@ -62,11 +59,11 @@ def test_direction_arrows_point_the_way_the_robot_drove():
 
 def test_the_power_map_says_what_its_decibels_refer_to():
     run = made_run()
-    labels = [axes.get_ylabel() for axes in power_map_figure(run).axes[0].child_axes]
-    assert labels == ["mean emitted power [dB re (full scale)²]"]
+    labels = [axes.get_ylabel() for axes in power_map_figure(run).axes]
+    assert labels == ["y [m]", "mean emitted power [dB re (full scale)²]"]
     calibrated = replace(run.power_map, reference=LevelReference.SOUND_PRESSURE)
     figure = power_map_figure(replace(run, power_map=calibrated))
-    assert figure.axes[0].child_axes[0].get_ylabel() == "mean emitted power [dB re (20 µPa)²]"
+    assert figure.axes[1].get_ylabel() == "mean emitted power [dB re (20 µPa)²]"
 
 
 def test_unmeasured_cells_stay_empty_and_silent_cells_do_not():
@@ -108,37 +105,16 @@ def test_a_small_ratio_is_not_blown_up_to_full_colours():
     assert figure.axes[0].images[-1].get_clim() == (-3.0, 3.0)
 
 
-def test_the_audio_scans_stand_at_their_bearing_and_time_and_gaps_stay_empty():
-    bearing = np.arange(8) * np.pi / 4
-    power = np.full((6, 8), 1e-6, dtype=np.float32)
-    power[0, 6] = 1e-3  # 270 degrees, that is -90
-    time_ns = START_NS + np.array([0, 1, 2, 7, 8, 9]) * 100_000_000
-    scans = AudioScans(time_ns, bearing, power, LevelReference.FULL_SCALE)
-    drawn = drawn_values(audio_scan_figure(replace(made_run(), scans=scans)))
-    assert drawn.shape == (8, 10)
-    assert drawn[2, 0] == pytest.approx(-30.0)  # rows: -180, -135, -90, ...
-    assert drawn.mask.all(axis=0).tolist() == [False] * 3 + [True] * 4 + [False] * 3
-
-
-def test_an_hour_of_audio_scans_is_averaged_to_what_a_picture_can_show():
-    time_ns = START_NS + np.arange(36_000) * 100_000_000
-    power = np.ones((36_000, 4), dtype=np.float32)
-    power[::2] = 3.0
-    scans = AudioScans(time_ns, np.arange(4) * np.pi / 2, power, LevelReference.FULL_SCALE)
-    drawn = drawn_values(audio_scan_figure(replace(made_run(), scans=scans)))
-    assert drawn.shape == (4, 1200)
-    np.testing.assert_allclose(drawn, 10 * np.log10(2.0), atol=1e-6)
-
-
-@pytest.mark.parametrize("figure", [power_map_figure, audio_scan_figure])
-def test_a_run_that_heard_nothing_says_so(figure):
-    assert "nothing measured" in texts(figure(unlucky_run()))
+def test_a_run_that_heard_nothing_says_so():
+    figure = power_map_figure(unlucky_run())
+    assert "nothing measured" in texts(figure)
+    assert len(figure.axes) == 1  # no colour bar of levels that nobody measured
 
 
 @pytest.mark.parametrize(
     ("width_m", "height_m"), [(6.0, 4.5), (60.0, 2.0), (2.0, 60.0), (0.6, 0.4), (200.0, 150.0)]
 )
-def test_pictures_have_a_sensible_size_whatever_the_site(tmp_path, width_m, height_m):
+def test_pictures_have_a_sensible_size_whatever_the_site(width_m, height_m):
     room = walled_room(width_m, height_m, step=0.05 if width_m < 100 else 0.2)
     run = replace(
         made_run(),
@@ -146,17 +122,16 @@ def test_pictures_have_a_sensible_size_whatever_the_site(tmp_path, width_m, heig
         trajectory=round_trip(width_m, height_m),
         sources=SourceList((), LevelReference.FULL_SCALE),
     )
-    write_png(trajectory_figure(run), tmp_path / "trajectory.png")
-    rows, columns, _ = imread(tmp_path / "trajectory.png").shape
+    content = picture_bytes(trajectory_figure(run), PictureFormat.PNG)
+    rows, columns, _ = imread(io.BytesIO(content)).shape
     assert 300 <= rows <= 1300
-    assert 500 <= columns <= 1400
+    assert 800 <= columns <= 1400
 
 
 @pytest.mark.parametrize("name", ["$x^{.mcap", "走廊[red].mcap", "a_b^c%.mcap"])
-def test_the_name_of_a_log_is_never_taken_for_a_formula(tmp_path, name):
+def test_the_name_of_a_log_is_never_taken_for_a_formula(name):
     run = replace(made_run(), log=made_run().log.with_name(name))
-    write_png(power_map_figure(run), tmp_path / "power_map.png")
-    assert (tmp_path / "power_map.png").read_bytes()[:4] == b"\x89PNG"
+    assert picture_bytes(power_map_figure(run), PictureFormat.PNG)[:4] == b"\x89PNG"
 
 
 def test_the_area_shows_the_run_and_what_is_near_it_not_the_whole_site():
@@ -173,3 +148,80 @@ def test_cropping_keeps_every_cell_that_reaches_into_the_area():
     part, extent = cropped(values, frame, Area(-0.5, 1.5, 11.5, 12.5))
     np.testing.assert_array_equal(part, values[1:3, 1:4])
     assert extent == (-1.0, 2.0, 11.0, 13.0)
+
+
+def overlap(a, b) -> bool:
+    return a.x0 < b.x1 and b.x0 < a.x1 and a.y0 < b.y1 and b.y0 < a.y1
+
+
+@pytest.mark.parametrize(("width_m", "height_m"), [(6.0, 4.5), (60.0, 2.0), (2.0, 60.0)])
+def test_nothing_written_is_clipped_or_overlaps(width_m, height_m):
+    room = walled_room(width_m, height_m)
+    run = replace(
+        made_run(made_run().log.with_name("a_name_of_a_log_that_is_rather_long_" * 3)),
+        room=room,
+        trajectory=round_trip(width_m, height_m),
+        power_map=heard_map(room.frame, [(1.0, 1.0, 1e-6)]),
+        sources=SourceList((Source(1.0, 1.0, 1e-6, 9),), LevelReference.FULL_SCALE),
+    )
+    for figure in (power_map_figure(run), trajectory_figure(run)):
+        figure.canvas.draw()
+        boxes = [text.get_window_extent() for text in figure.texts]
+        boxes += [axes.xaxis.label.get_window_extent() for axes in figure.axes]
+        boxes += [axes.yaxis.label.get_window_extent() for axes in figure.axes]
+        boxes += [legend.get_window_extent() for legend in figure.legends]
+        boxes = [box for box in boxes if box.width > 1 and box.height > 1]
+        for index, box in enumerate(boxes):
+            assert box.x0 >= 0
+            assert box.y0 >= 0
+            assert box.x1 <= figure.bbox.x1
+            assert box.y1 <= figure.bbox.y1
+            assert not any(overlap(box, other) for other in boxes[index + 1 :])
+            assert not any(overlap(box, axes.get_window_extent()) for axes in figure.axes)
+
+
+def test_the_truth_is_drawn_as_crosses_inside_the_picture():
+    figure = power_map_figure(made_run(), truth=[(3.0, 0.3), (11.0, 3.0)])
+    (crosses,) = (line for line in figure.axes[0].lines if line.get_label() == "truth")
+    assert crosses.get_marker() == "x"
+    assert crosses.get_xydata().tolist() == [[3.0, 0.3], [11.0, 3.0]]
+    assert figure.axes[0].get_xlim()[1] > 11.0
+    assert "truth" not in legend(power_map_figure(made_run()))
+
+
+def test_a_lone_loud_cell_of_a_huge_site_is_still_seen():
+    room = walled_room(200.0, 150.0, step=0.2)
+    frame = GridFrame(0.05, room.frame.origin_m, (3020, 4020))
+    visits = np.zeros(frame.shape, dtype=np.int64)
+    power_sum = np.zeros(frame.shape)
+    visits[1234, 2345] = visits[10, 10] = 20
+    power_sum[1234, 2345], power_sum[10, 10] = 2e-5, 2e-8
+    run = replace(
+        made_run(),
+        room=room,
+        trajectory=round_trip(200.0, 150.0),
+        power_map=PowerMap(frame, power_sum, visits, LevelReference.FULL_SCALE),
+    )
+    figure = power_map_figure(run)
+    drawn = drawn_values(figure)
+    assert drawn.count() == 2
+    row, column = np.unravel_index(np.argmax(drawn), drawn.shape)
+    left, right, bottom, _ = figure.axes[0].images[-1].get_extent()
+    edge = (right - left) / drawn.shape[1]
+    assert edge * 1000 / 200.0 >= 2.5  # dots of a picture of 1000 dots
+    x, y = frame.centres((1234, 2345))
+    assert left + column * edge <= x <= left + (column + 1) * edge
+    assert bottom + row * edge <= y <= bottom + (row + 1) * edge
+    assert "greatest of each" in figure.axes[1].get_ylabel()
+
+
+def test_a_difference_keeps_its_sign_where_cells_are_drawn_together():
+    ratio = made_ratio()
+    frame = GridFrame(0.05, (0.0, 0.0), (2000, 3000))
+    level = np.full(frame.shape, np.nan)
+    level[100, 200:203] = [1.0, -8.0, np.nan]
+    measured = np.ones(frame.shape, dtype=bool)
+    level[0, 0] = level[-1, -1] = 0.0
+    sparse = replace(ratio, frame=frame, ratio_db=level, background_measured=measured, changes=())
+    drawn = drawn_values(power_ratio_figure(sparse, room=None, title="run1 against run3"))
+    assert drawn.min() == -8.0

@@ -1,0 +1,56 @@
+import re
+
+import pytest
+from handmade import made_ratio, made_run, walled_room
+
+from soundmap.outputs.picture_format import PictureFormat
+from soundmap.outputs.pictures import difference_pictures, run_pictures, write_pictures
+
+OPENING = {
+    PictureFormat.PNG: b"\x89PNG",
+    PictureFormat.PDF: b"%PDF",
+    PictureFormat.SVG: b"<?xml",
+}
+
+
+def pictures():
+    return difference_pictures(made_ratio(), room=walled_room(), title="run1 against run3")
+
+
+@pytest.mark.parametrize("form", list(OPENING))
+def test_a_picture_comes_in_the_format_asked_for_with_equal_bytes_every_time(tmp_path, form):
+    contents = []
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+        write_pictures(pictures, tmp_path / name, form)
+        (file,) = (tmp_path / name).iterdir()
+        assert file.name == f"power_ratio.{form}"
+        contents.append(file.read_bytes())
+    assert contents[0][:5].startswith(OPENING[form])
+    assert contents[0] == contents[1]
+
+
+def test_a_browser_is_given_what_it_can_show(tmp_path):
+    for form, expected in ((PictureFormat.PDF, b"\x89PNG"), (PictureFormat.SVG, b"<?xml")):
+        (content,) = write_pictures(pictures, tmp_path, form).values()
+        assert content.startswith(expected)
+
+
+def test_without_pictures_nothing_is_drawn_or_written(tmp_path):
+    def refused():
+        raise AssertionError("drawn")
+
+    assert write_pictures(refused, tmp_path, PictureFormat.NONE) == {}
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_vector_picture_refers_to_nothing_outside_itself(tmp_path):
+    write_pictures(pictures, tmp_path, PictureFormat.SVG)
+    text = (tmp_path / "power_ratio.svg").read_text()
+    links = re.findall(r'(?:href|src)="([^"]*)"', text)
+    assert links
+    assert all(link.startswith(("#", "data:")) for link in links)
+
+
+def test_a_run_has_its_three_pictures_the_map_of_power_first():
+    assert list(run_pictures(made_run())) == ["power_map", "trajectory", "audio_scans"]
