@@ -1,0 +1,1 @@
+"""The geometric map from laser scans and odometry alone, with loop closure. Sect. 2.1."""
