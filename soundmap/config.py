@@ -90,6 +90,33 @@ class AudioConfig(Table):
     """Whether a stamp is that of a block's first sample or of its end; "auto": by schema."""
 
 
+class MappingConfig(Table):
+    """Map building, Sect. 2.1."""
+
+    key_distance_m: Positive = 0.20
+    """The map is made of key scans: one each time a scanner has moved this far [m] ..."""
+    key_angle_rad: Positive = math.radians(10.0)
+    """... or turned this far [rad]."""
+    returns: Annotated[int, Field(ge=50)] = 300
+    """Returns kept of a key scan ..."""
+    return_spacing_m: Positive = 0.05
+    """... and their least distance from each other [m]."""
+    neighbours: Annotated[int, Field(ge=4)] = 14
+    """Scans that each key scan is laid on."""
+    loop_window_m: Positive = 6.0
+    """Greatest drift within which a place seen before is searched for [m]."""
+    cell_m: Positive = 0.05
+    """Edge of a cell of the map [m]."""
+    occupied_share: Annotated[float, Field(gt=0, le=1)] = 0.35
+    """A cell is occupied if at least this share of the rays that reach it end in it."""
+    noise_distance_per_metre: Positive = 0.10
+    """Odometry is first taken to be off by this much of each metre [m/m] ..."""
+    noise_turn_per_metre: Positive = 0.05
+    """... to turn by this much a metre unawares [rad/m] ..."""
+    noise_turn_per_turn: Positive = 0.10
+    """... and by this much of each turn [rad/rad]; then its errors are estimated from the run."""
+
+
 class LocalizeConfig(Table):
     """Particle filter of Sect. 2.2."""
 
@@ -211,6 +238,7 @@ class Config(Table):
     mounts: dict[str, PlanarMount] = Field(default_factory=dict)
     """x, y, z [m] and yaw [rad] in the base frame by frame name; wins over /tf_static."""
     audio: AudioConfig = AudioConfig()
+    map: MappingConfig = MappingConfig()
     localize: LocalizeConfig = LocalizeConfig()
     scan: ScanConfig = ScanConfig()
     fuse: FuseConfig = FuseConfig()

@@ -1,0 +1,315 @@
+"""From laser scans and odometry to the geometric map and the trajectory in it. Sect. 2.1.
+
+Key scans are laid on their neighbours one by one, loops are closed as they are met, all overlapping
+scans are relaxed together, and the rays of the relaxed scans are drawn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soundmap.config import MappingConfig
+from soundmap.geometry import FloatArray, Trajectory, composed, inverted, relative, wrapped_angle
+from soundmap.grid import OccupancyGrid
+from soundmap.losses import LossLedger
+from soundmap.mapping.growing_graph import GrowingGraph
+from soundmap.mapping.key_scans import STAGE, KeyScan, KeyScans, chosen_key_scans
+from soundmap.mapping.links import odometry_links
+from soundmap.mapping.loops import LoopSearch, close_loops
+from soundmap.mapping.occupancy import drawn_map
+from soundmap.mapping.odometry_model import OdometryModel, fitted_odometry
+from soundmap.mapping.pose_graph import Links, link_errors, solved_graph
+from soundmap.mapping.relaxation import relaxed_poses
+from soundmap.sensors import LaserScan
+
+LOOP_EVERY_M = 0.5
+"""Way between two searches for loops."""
+FIRST_GATES_M = (0.4, 0.3, 0.2)
+LAST_GATES_M = (0.25, 0.2, 0.15, 0.15, 0.12, 0.12, 0.10, 0.10, 0.10)
+RARE_NS = 200_000_000
+"""Where laser scans are farther apart, the trajectory has the poses of the odometry as well."""
+GROWING, RELAXING = 0.7, 0.3
+"""Shares of the work, for the progress shown."""
+
+
+@dataclass(frozen=True)
+class MapFacts:
+    """How the map came about.
+
+    Attributes
+    ----------
+    key_scans : int
+        Scans that it is made of.
+    unmatched : int
+        Key scans that fitted none of their neighbours and stand where odometry put them.
+    loops_searched, loops_recognised, loops_closed : int
+        Searches for places seen before, places recognised, and ties that the whole map bore out.
+    links : int
+        Pairs of scans that hold each other in place.
+    residual_m, residual_rad : float
+        Median disagreement of a pair of scans with the map [m, rad].
+    body_returns : int
+        Returns removed because they came from the robot itself.
+    odometry : OdometryModel
+        Systematic and random errors of the odometry, from the finished map.
+    """
+
+    key_scans: int
+    unmatched: int
+    loops_searched: int
+    loops_recognised: int
+    loops_closed: int
+    links: int
+    residual_m: float
+    residual_rad: float
+    body_returns: int
+    odometry: OdometryModel
+
+
+@dataclass(frozen=True)
+class BuiltMap:
+    """The geometric map of a run and the trajectory in it; the origin is at the first pose.
+
+    Attributes
+    ----------
+    room : OccupancyGrid
+    trajectory : Trajectory
+        Base in the map frame, one pose a laser scan, and one an odometry pose where laser scans
+        are rare; those between key scans are carried there by odometry. Usable unless far from
+        every key scan that fits the map.
+    facts : MapFacts
+    """
+
+    room: OccupancyGrid
+    trajectory: Trajectory
+    facts: MapFacts
+
+
+def build_map(
+    lasers: Callable[[], Iterable[LaserScan]],
+    odometry: Trajectory,
+    config: MappingConfig,
+    *,
+    losses: LossLedger | None = None,
+    report: Callable[[float], None] = lambda _: None,
+) -> BuiltMap:
+    """Map and trajectory from laser scans and odometry alone.
+
+    Parameters
+    ----------
+    lasers : callable
+        Gives the scans of all scanners, ordered by time; a fresh pass a call.
+    odometry : Trajectory
+        Base in the odometry frame.
+    config : MappingConfig
+    losses : LossLedger, optional
+        Where what could not be used is counted.
+    report : callable, optional
+        Told the share of the work that is done, 0 to 1.
+
+    Raises
+    ------
+    NothingUsableError
+        No scan has enough returns within the time of the odometry.
+    """
+    losses = LossLedger() if losses is None else losses
+    keys = chosen_key_scans(
+        lasers(),
+        odometry,
+        distance_m=config.key_distance_m,
+        angle_rad=config.key_angle_rad,
+        most_returns=config.returns,
+        spacing_m=config.return_spacing_m,
+        losses=losses,
+    )
+    model = OdometryModel(
+        noise_distance_per_metre=config.noise_distance_per_metre,
+        noise_turn_per_metre=config.noise_turn_per_metre,
+        noise_turn_per_turn=config.noise_turn_per_turn,
+    )
+    graph = GrowingGraph(keys.scans, model, config.neighbours)
+    search = _grown(graph, config, report)
+    pose, _ = _relaxed(keys.scans, graph.pose, model, config, FIRST_GATES_M)
+    graph.replace_poses(pose)
+    search += _searched_again(graph, config)
+    model = _fitted_model(keys.scans, graph.pose, model)
+    pose, links = _relaxed(
+        keys.scans,
+        graph.pose,
+        model,
+        config,
+        LAST_GATES_M,
+        lambda done: report(GROWING + RELAXING * done / len(LAST_GATES_M)),
+    )
+    losses.add(
+        "laser scan that fits none of its neighbours",
+        STAGE,
+        effect="placed by odometry",
+        count=int(np.count_nonzero(~graph.matched)),
+    )
+    facts = _facts(keys, pose, links, graph.matched, search, model)
+    pose = composed(inverted(pose[0]), pose)
+    times = pose_times(keys.time_ns, odometry)
+    return BuiltMap(
+        drawn_map(keys.scans, pose, cell_m=config.cell_m, occupied_share=config.occupied_share),
+        carried_trajectory(times, odometry, keys.scans, pose, graph.matched),
+        facts,
+    )
+
+
+def _grown(
+    graph: GrowingGraph, config: MappingConfig, report: Callable[[float], None]
+) -> LoopSearch:
+    """Add all scans, closing loops on the way."""
+    search = LoopSearch()
+    distance, searched_m = np.zeros(1), 0.0
+    for new in range(1, len(graph.scans)):
+        graph.add_next(distance)
+        step = float(np.hypot(*(graph.pose[new, :2] - graph.pose[new - 1, :2])))
+        distance = np.append(distance + step, 0.0)
+        driven_m = graph.scans[new].driven_m
+        if driven_m - searched_m >= LOOP_EVERY_M or new == len(graph.scans) - 1:
+            searched_m = driven_m
+            distance = graph.distances_from(new)
+            outcome = close_loops(graph, new, distance, most_drift_m=config.loop_window_m)
+            if outcome.closed:
+                distance = graph.distances_from(new)
+            search += outcome
+        report(GROWING * new / len(graph.scans))
+    return search
+
+
+def _searched_again(graph: GrowingGraph, config: MappingConfig) -> LoopSearch:
+    """Loops that were missed on the way, now that the poses are better."""
+    search, searched_m = LoopSearch(), -np.inf
+    for scan in range(len(graph.scans)):
+        if graph.scans[scan].driven_m - searched_m < 2.0 * LOOP_EVERY_M:
+            continue
+        searched_m = graph.scans[scan].driven_m
+        distance = graph.distances_from(scan)
+        search += close_loops(graph, scan, distance, most_drift_m=config.loop_window_m)
+    if search.closed:
+        graph.replace_poses(solved_graph(graph.pose, graph.links()).pose)
+    return search
+
+
+def _relaxed(
+    scans: Sequence[KeyScan],
+    pose: FloatArray,
+    model: OdometryModel,
+    config: MappingConfig,
+    gates_m: Sequence[float],
+    report: Callable[[int], None] = lambda _: None,
+) -> tuple[FloatArray, Links]:
+    return relaxed_poses(
+        scans,
+        pose,
+        odometry_links(scans, model),
+        neighbours=config.neighbours,
+        gates_m=gates_m,
+        report=report,
+    )
+
+
+def _facts(
+    keys: KeyScans,
+    pose: FloatArray,
+    links: Links,
+    matched: NDArray[np.bool_],
+    search: LoopSearch,
+    model: OdometryModel,
+) -> MapFacts:
+    error = link_errors(pose, links)[len(pose) - 1 :]  # the first links are the odometry's
+    found = len(error) > 0
+    return MapFacts(
+        key_scans=len(pose),
+        unmatched=int(np.count_nonzero(~matched)),
+        loops_searched=search.tried,
+        loops_recognised=search.found,
+        loops_closed=search.closed,
+        links=len(error),
+        residual_m=float(np.median(np.hypot(error[:, 0], error[:, 1]))) if found else 0.0,
+        residual_rad=float(np.median(np.abs(error[:, 2]))) if found else 0.0,
+        body_returns=keys.body_returns,
+        odometry=_fitted_model(keys.scans, pose, model),
+    )
+
+
+def _fitted_model(
+    scans: Sequence[KeyScan], pose: FloatArray, model: OdometryModel
+) -> OdometryModel:
+    """The errors of the odometry over pieces long enough to rise above those of the map."""
+    driven = np.array([scan.driven_m for scan in scans])
+    turned = np.array([scan.turned_rad for scan in scans])
+    piece = np.floor(driven / 0.5 + turned / 0.5).astype(np.int64)
+    ends = np.flatnonzero(np.append(True, np.diff(piece) > 0))
+    odometry = np.array([scan.odometry for scan in scans])
+    return fitted_odometry(
+        relative(odometry[ends[:-1]], odometry[ends[1:]]),
+        relative(pose[ends[:-1]], pose[ends[1:]]),
+        model,
+    )
+
+
+def carried_trajectory(
+    time_ns: NDArray[np.int64],
+    odometry: Trajectory,
+    scans: Sequence[KeyScan],
+    pose: FloatArray,
+    matched: NDArray[np.bool_],
+) -> Trajectory:
+    """Poses at other times than those of the key scans, carried there by odometry.
+
+    Between two key scans the pose is that carried forward from the one blended with that carried
+    back from the other, by the way and the turn between them.
+
+    Parameters
+    ----------
+    time_ns : ndarray of int64, shape (S,)
+        Increasing, within the time of the odometry.
+    odometry : Trajectory
+    scans : sequence of KeyScan
+    pose : ndarray, shape (K, 3)
+        Of the key scans.
+    matched : ndarray of bool, shape (K,)
+        Whether a key scan fits the map.
+    """
+    key_ns = np.array([scan.time_ns for scan in scans], dtype=np.int64)
+    key_odometry = np.array([scan.odometry for scan in scans])
+    reported = odometry.at(time_ns)
+    after = np.clip(np.searchsorted(key_ns, time_ns, side="right"), 1, max(len(key_ns) - 1, 1))
+    before, after = after - 1, np.minimum(after, len(key_ns) - 1)
+    forward = composed(pose[before], relative(key_odometry[before], reported))
+    backward = composed(pose[after], relative(key_odometry[after], reported))
+    progress = motion_progress(odometry)
+    own = np.interp(time_ns, odometry.time_ns, progress)
+    key = np.interp(key_ns, odometry.time_ns, progress)
+    way = np.maximum(key[after] - key[before], 1e-9)
+    share = np.clip((own - key[before]) / way, 0.0, 1.0)
+    share[time_ns >= key_ns[after]] = 1.0
+    blended = forward + share[:, None] * (backward - forward)
+    turn = wrapped_angle(backward[:, 2] - forward[:, 2])
+    blended[:, 2] = wrapped_angle(forward[:, 2] + share * turn)
+    return Trajectory(time_ns, blended, matched[before] | matched[after])
+
+
+def motion_progress(odometry: Trajectory) -> FloatArray:
+    """Way [m] and turn [rad] up to each pose of the odometry added up, and a trace of time."""
+    turned = np.cumsum(
+        np.abs(wrapped_angle(np.diff(odometry.pose[:, 2], prepend=odometry.pose[:1, 2])))
+    )
+    elapsed_s = (odometry.time_ns - odometry.time_ns[0]) * 1e-9
+    return odometry.driven_m() + turned + 1e-6 * elapsed_s
+
+
+def pose_times(laser_ns: NDArray[np.int64], odometry: Trajectory) -> NDArray[np.int64]:
+    """Times of the laser scans, and those of the odometry wherever laser scans are rare."""
+    inside = (odometry.time_ns > laser_ns[0]) & (odometry.time_ns < laser_ns[-1])
+    times = odometry.time_ns[inside]
+    after = np.searchsorted(laser_ns, times)
+    rare = laser_ns[after] - laser_ns[np.maximum(after - 1, 0)] > RARE_NS
+    return np.unique(np.concatenate([laser_ns, times[rare]]))

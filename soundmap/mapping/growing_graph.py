@@ -1,0 +1,184 @@
+"""The map grown scan by scan: every key scan is laid on those near it that are known well.
+
+How well two scans are known relative to each other is judged by the shortest way through the graph
+from one to the other: errors grow along it (Olson, "Robust and efficient robotic mapping", 2008).
+Scans that are near in space but far in the graph are candidates for closing a loop.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soundmap.geometry import FloatArray, composed, transformed, wrapped_angle
+from soundmap.mapping.alignment import PointStore, aligned_scan, pair_fits
+from soundmap.mapping.correlation import best_placement, nearness_grid
+from soundmap.mapping.key_scans import KeyScan
+from soundmap.mapping.links import odometry_links, scan_links
+from soundmap.mapping.odometry_model import OdometryModel
+from soundmap.mapping.pose_graph import Links
+
+REACH_M = 5.0
+"""Scans this near are likely to see the same surfaces."""
+CONNECTED_M = 8.0
+"""Scans no farther than this in the graph are known well relative to each other."""
+FAR = 1e9
+TURN_M_PER_RAD = 1.0
+"""A turn of 1 rad makes scans as different as this distance does."""
+LATEST = 4
+MOST_LINKS = 5
+LEAST_MATCHED_SHARE = 0.35
+LEAST_MATCHED = 15
+SEARCH_BEYOND_M, SEARCH_BEYOND_RAD = 0.15, 0.12
+"""If odometry may be off by more than this, the pose is searched for, not only refined."""
+GATES_M = (0.3, 0.15)
+
+
+class GrowingGraph:
+    """Poses of the key scans so far, and the links between them.
+
+    Parameters
+    ----------
+    scans : sequence of KeyScan
+        All key scans of the run by time.
+    model : OdometryModel
+    neighbours : int
+        Scans that a new one is laid on.
+    """
+
+    def __init__(self, scans: Sequence[KeyScan], model: OdometryModel, neighbours: int) -> None:
+        self.scans, self.model, self._neighbours = scans, model, neighbours
+        self._pose = np.zeros((len(scans), 3))
+        self.count = 1
+        self.matched = np.zeros(len(scans), dtype=bool)
+        self.matched[0] = True
+        self._odometry_links = odometry_links(scans, model)
+        self._scan_links: list[Links] = []
+
+    @property
+    def pose(self) -> FloatArray:
+        """Poses of the scans added, shape (count, 3)."""
+        return self._pose[: self.count]
+
+    def replace_poses(self, pose: FloatArray) -> None:
+        """Take better poses of the scans added."""
+        self._pose[: self.count] = pose
+
+    def links(self) -> Links:
+        """All links between the scans added."""
+        odometry = self._odometry_links
+        done = self.count - 1
+        chain = Links(odometry.pairs[:done], odometry.measured[:done], odometry.information[:done])
+        return Links.joined([chain, *self._scan_links])
+
+    def add_links(self, links: Links) -> None:
+        """Add links between scans added."""
+        self._scan_links.append(links)
+
+    def distances_from(self, scan: int) -> FloatArray:
+        """Shortest way through the graph from one scan to every scan added [m], shape (count,)."""
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import dijkstra
+
+        pairs = np.concatenate(
+            [self._odometry_links.pairs[: self.count - 1], *(x.pairs for x in self._scan_links)]
+        )
+        if len(pairs) == 0:
+            return np.zeros(self.count)
+        gap = self._pose[pairs[:, 0], :2] - self._pose[pairs[:, 1], :2]
+        # coo_array adds up what is given twice; only the first of equal pairs may stay.
+        _, once = np.unique(pairs[:, 0] * self.count + pairs[:, 1], return_index=True)
+        length = 0.02 + np.hypot(gap[:, 0], gap[:, 1])
+        graph = coo_array(
+            (length[once], (pairs[once, 0], pairs[once, 1])), shape=(self.count, self.count)
+        )
+        return dijkstra(graph.tocsr(), directed=False, indices=scan)
+
+    def add_next(self, distance: FloatArray) -> None:
+        """Add the next scan; ``distance`` as from `distances_from` its predecessor."""
+        new = self.count
+        step = self._odometry_links
+        expected = composed(self._pose[new - 1], step.measured[new - 1])
+        targets = self._targets(expected, distance)
+        self._pose[new] = expected
+        self.count += 1
+        links = self._laid_on(new, targets, expected, step.information[new - 1])
+        if links is not None:
+            self.matched[new] = True
+            self._scan_links.append(links)
+
+    def _targets(self, expected: FloatArray, distance: FloatArray) -> NDArray[np.int64]:
+        """Well-known scans near a pose: some of the latest, and the most alike."""
+        pose = self.pose
+        gap = np.hypot(pose[:, 0] - expected[0], pose[:, 1] - expected[1])
+        near = np.flatnonzero((gap < REACH_M) & (distance < CONNECTED_M))
+        turn = np.abs(wrapped_angle(pose[near, 2] - expected[2]))
+        unlike = gap[near] + TURN_M_PER_RAD * turn
+        alike = near[np.argsort(unlike, kind="stable")]
+        latest = near[-LATEST:]
+        rest = alike[~np.isin(alike, latest)][: max(self._neighbours - LATEST, 0)]
+        return np.concatenate([latest, rest])
+
+    def _laid_on(
+        self,
+        new: int,
+        targets: NDArray[np.int64],
+        expected: FloatArray,
+        prior_information: FloatArray,
+    ) -> Links | None:
+        """Lay the new scan on others; links to those it fits best, None if it fits none."""
+        if len(targets) == 0:
+            return None
+        index = np.append(targets, new)
+        store = PointStore.of([self.scans[k] for k in index])
+        pose = self._pose[index].copy()
+        pose[-1] = self._searched(new, targets, expected, prior_information)
+        found = aligned_scan(
+            store,
+            pose,
+            moving=len(targets),
+            prior=expected,
+            prior_information=prior_information,
+            gates_m=GATES_M,
+        )
+        if found.matched < LEAST_MATCHED_SHARE:
+            return None
+        pose[-1] = self._pose[new] = found.pose
+        others = np.arange(len(targets))
+        pairs = np.stack([np.full(len(targets), len(targets)), others], axis=-1)
+        fits = pair_fits(store, pose, pairs, gate_m=GATES_M[-1])
+        links = scan_links(pose, pairs, fits, least_matched=LEAST_MATCHED)
+        strength = np.linalg.det(links.information) ** (1.0 / 3.0)
+        best = np.argsort(-strength, kind="stable")[:MOST_LINKS]
+        if len(best) == 0:
+            return None
+        return Links(index[links.pairs[best]], links.measured[best], links.information[best])
+
+    def _searched(
+        self,
+        new: int,
+        targets: NDArray[np.int64],
+        expected: FloatArray,
+        prior_information: FloatArray,
+    ) -> FloatArray:
+        """Where to begin: the best pose within three standard deviations of the expected one."""
+        window_m = 3.0 / np.sqrt(prior_information[0, 0])
+        window_rad = 3.0 / np.sqrt(prior_information[2, 2])
+        if window_m < SEARCH_BEYOND_M and window_rad < SEARCH_BEYOND_RAD:
+            return expected
+        grid = nearness_grid(self.points_of(targets), expected[:2])
+        found = best_placement(
+            grid,
+            self.scans[new].end_m,
+            expected,
+            window_m=min(window_m, 2.0),
+            window_rad=min(window_rad, np.pi / 3),
+            least_score=0.2,
+        )
+        return expected if found is None else found.pose
+
+    def points_of(self, index: NDArray[np.int64]) -> FloatArray:
+        """Returns of some scans in the map frame, shape (P, 2) [m]."""
+        return np.concatenate([transformed(self._pose[k], self.scans[k].end_m) for k in index])

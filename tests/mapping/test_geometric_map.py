@@ -1,0 +1,122 @@
+import numpy as np
+import pytest
+
+from soundmap.config import MappingConfig
+from soundmap.errors import NothingUsableError
+from soundmap.geometry import Trajectory, composed, transformed
+from soundmap.losses import LossLedger
+from soundmap.mapping.geometric_map import build_map, carried_trajectory, pose_times
+from tests import worlds
+from tests.mapping import drives
+
+ERRORS = {
+    "sound odometry": {},
+    "odometry long by 5 % that bends to the left": {"scale": 1.05, "turn_per_metre": 0.05},
+    "odometry short by 5 % that bends to the right": {"scale": 0.95, "turn_per_metre": -0.05},
+}
+
+
+@pytest.fixture(scope="module")
+def drive():
+    truth = worlds.driven(drives.ROUND)
+    scans = worlds.laser_scans(truth, [worlds.FRONT, worlds.BACK], rate_hz=10, beams=361)
+    return truth, drives.noisy(scans, 0.015)
+
+
+def distance_to_walls(points):
+    walls = worlds.segments()
+    along = walls[:, 1] - walls[:, 0]
+    share = np.einsum("psk,sk->ps", points[:, None] - walls[:, 0], along) / np.sum(along**2, 1)
+    foot = walls[:, 0] + np.clip(share, 0, 1)[..., None] * along
+    return np.hypot(*np.moveaxis(points[:, None] - foot, -1, 0)).min(axis=1)
+
+
+@pytest.mark.parametrize("error", ERRORS.values(), ids=ERRORS)
+def test_a_drive_is_mapped_whatever_the_odometry(drive, error):
+    truth, scans = drive
+    built = build_map(lambda: scans, drives.reported(truth, **error), MappingConfig())
+    true = drives.from_first(truth, built.trajectory.time_ns)
+    off_m, off_rad = drives.errors(built.trajectory.pose, true)
+    assert np.median(off_m) < 0.01
+    assert np.max(off_m) < 0.03
+    assert np.median(off_rad) < np.radians(0.15)
+    assert built.trajectory.usable.all()
+    start = truth.at(built.trajectory.time_ns[0])
+    walls = transformed(start, built.room.frame.centres(np.argwhere(built.room.occupied)))
+    distance = distance_to_walls(walls)
+    assert np.mean(distance < 0.06) > 0.98, "walls stand where they are, and once"
+    assert len(walls) > 300
+    if error:
+        assert built.facts.odometry.distance_scale == pytest.approx(1 / error["scale"], abs=0.01)
+
+
+def test_one_scanner_with_half_a_view_is_enough(drive):
+    truth, scans = drive
+    front = [scan for scan in scans if scan.scanner == 0]
+    built = build_map(lambda: front, drives.reported(truth, scale=1.03), MappingConfig())
+    true = drives.from_first(truth, built.trajectory.time_ns)
+    assert np.median(drives.errors(built.trajectory.pose, true)[0]) < 0.02
+
+
+def test_the_same_log_gives_the_same_map(drive):
+    truth, scans = drive
+    odometry = drives.reported(truth, scale=1.02)
+    first, second = (build_map(lambda: scans[:120], odometry, MappingConfig()) for _ in range(2))
+    np.testing.assert_array_equal(first.trajectory.pose, second.trajectory.pose)
+    np.testing.assert_array_equal(first.room.occupied, second.room.occupied)
+
+
+def test_a_robot_that_stands_still_maps_what_it_sees(drive):
+    _, scans = drive
+    time_ns = np.array([scans[0].time_ns - 10**9, scans[0].time_ns + 10**9])
+    still = Trajectory(time_ns, np.zeros((2, 3)), np.ones(2, dtype=bool))
+    built = build_map(lambda: scans[:1], still, MappingConfig())
+    assert len(built.trajectory) == 1
+    assert built.facts.key_scans == 1
+    assert built.room.occupied.sum() > 50
+
+
+def test_progress_never_goes_back_and_losses_are_told(drive):
+    truth, scans = drive
+    told, losses = [], LossLedger()
+    late = Trajectory(truth.time_ns[200:], truth.pose[200:], truth.usable[200:])
+    build_map(lambda: scans[:150], late, MappingConfig(), losses=losses, report=told.append)
+    assert told == sorted(told)
+    assert 0.99 < told[-1] <= 1.0
+    assert [loss.what for loss in losses] == ["laser scan without odometry"]
+
+
+def test_nothing_to_map_is_an_error(drive):
+    truth, _ = drive
+    with pytest.raises(NothingUsableError, match="no map can be built"):
+        build_map(list, truth, MappingConfig())
+
+
+def test_between_key_scans_the_correction_is_spread_over_the_way():
+    time_ns = np.arange(11, dtype=np.int64) * 10**8
+    way = np.column_stack([np.arange(11) * 0.1, np.zeros((11, 2))])
+    odometry = Trajectory(time_ns, way, np.ones(11, dtype=bool))
+    key = drives.keys(
+        worlds.laser_scans(worlds.driven([(1, 1), (1.1, 1)]), [worlds.FRONT]),
+        worlds.driven([(1, 1), (1.1, 1)]),
+    ).scans[0]
+    pair = [
+        type(key)(**{**vars(key), "time_ns": int(time_ns[k]), "odometry": way[k]}) for k in (0, 10)
+    ]
+    pose = composed(np.array([5.0, 5.0, np.pi / 2]), np.array([[0.0, 0, 0], [1.1, 0, 0]]))
+    found = carried_trajectory(time_ns, odometry, pair, pose, np.array([True, False]))
+    np.testing.assert_allclose(found.pose[:, 1], 5.0 + 0.11 * np.arange(11), atol=1e-5)
+    assert found.usable.all()
+
+
+def test_rare_scans_are_joined_by_the_poses_of_the_odometry():
+    odometry = Trajectory(
+        np.arange(101, dtype=np.int64) * 10**8, np.zeros((101, 3)), np.ones(101, dtype=bool)
+    )
+    laser_ns = np.array([50, 100, 150, 4000, 4100]) * 10**6
+    found = pose_times(laser_ns, odometry)
+    assert set(laser_ns) <= set(found)
+    between = found[~np.isin(found, laser_ns)]
+    assert between.min() == 200 * 10**6
+    assert between.max() == 3900 * 10**6
+    assert len(between) == 38
