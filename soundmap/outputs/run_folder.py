@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 import zipfile
 import zlib
@@ -18,6 +19,7 @@ from soundmap.errors import LogError
 from soundmap.geometry import FloatArray, Trajectory
 from soundmap.grid import GridFrame, OccupancyGrid
 from soundmap.map_file import map_files
+from soundmap.outputs.html_report import report_html
 from soundmap.outputs.new_folder import REPORT, writing
 from soundmap.outputs.picture_format import PictureFormat
 from soundmap.outputs.pictures import difference_pictures, run_pictures, write_pictures
@@ -61,9 +63,9 @@ def write_run(
         write_arrays(folder / "audio_scans.npz", _audio_scan_arrays(run.scans))
         _write_map(folder, run.room)
         (folder / "config.toml").write_text(config_toml(run.config), encoding="utf-8")
-        write_pictures(partial(run_pictures, run), folder, figures)
+        shown = write_pictures(partial(run_pictures, run), folder, figures)
         report = run_report(run, {**run.timings_s, "outputs": time.perf_counter() - start})
-        _write_tables(folder, SOURCE_COLUMNS, report)
+        _write_report(folder, SOURCE_COLUMNS, report, shown)
     return report
 
 
@@ -106,7 +108,7 @@ def write_diff(
             _write_map(folder, room)
         title = f"{run.resolve().name} against {background.resolve().name}"
         pictures = partial(difference_pictures, ratio, room=room, title=title)
-        write_pictures(pictures, folder, figures)
+        shown = write_pictures(pictures, folder, figures)
         report = diff_report(
             ratio,
             run=run,
@@ -114,7 +116,7 @@ def write_diff(
             config=config,
             timings_s={**timings_s, "outputs": time.perf_counter() - start},
         )
-        _write_tables(folder, CHANGE_COLUMNS, report)
+        _write_report(folder, CHANGE_COLUMNS, report, shown)
     return report
 
 
@@ -243,7 +245,12 @@ def _write_map(folder: Path, room: OccupancyGrid) -> None:
         (folder / name).write_bytes(content)
 
 
-def _write_tables(folder: Path, columns: tuple[str, ...], report: Mapping[str, Any]) -> None:
-    rows = report["sources"]
-    (folder / "sources.csv").write_text(csv_text(columns, rows), encoding="utf-8")
-    (folder / REPORT).write_text(json_text(report) + "\n", encoding="utf-8")
+def _write_report(
+    folder: Path, columns: tuple[str, ...], report: Mapping[str, Any], shown: Mapping[str, bytes]
+) -> None:
+    """The report, for programs and for people, and its sources as a table."""
+    (folder / "sources.csv").write_text(csv_text(columns, report["sources"]), encoding="utf-8")
+    plain = json_text(report)
+    page = report_html(json.loads(plain), shown)
+    (folder / "report.html").write_text(page, encoding="utf-8")
+    (folder / REPORT).write_text(plain + "\n", encoding="utf-8")

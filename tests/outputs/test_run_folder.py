@@ -22,6 +22,7 @@ CONTENT = {
     "map.yaml",
     "power_map.npz",
     "power_map.png",
+    "report.html",
     "report.json",
     "sources.csv",
     "trajectory.png",
@@ -129,12 +130,15 @@ def test_equal_results_give_equal_bytes_whenever_they_are_written(folder, tmp_pa
     later = time.time() + 40_000_000.0
     monkeypatch.setattr(time, "time", lambda: later)
     write_run(made_run(), tmp_path)
-    for name in CONTENT - {"report.json"}:
+    for name in CONTENT - {"report.json", "report.html"}:
         assert (tmp_path / name).read_bytes() == (folder / name).read_bytes(), name
     reports = [json.loads((place / "report.json").read_text()) for place in (tmp_path, folder)]
     for report in reports:
         del report["timings_s"], report["speed"]
     assert reports[0] == reports[1]
+    timed = re.compile("<dt>(speed|time)</dt><dd>.*?</dd>")
+    pages = [(place / "report.html").read_text() for place in (tmp_path, folder)]
+    assert timed.sub("", pages[0]) == timed.sub("", pages[1])
 
 
 def test_a_run_that_heard_nothing_has_a_whole_folder_too(tmp_path):
@@ -169,6 +173,7 @@ def test_a_diff_folder_holds_every_file_and_its_ratio(tmp_path):
         "map.yaml",
         "power_ratio.npz",
         "power_ratio.png",
+        "report.html",
         "report.json",
         "sources.csv",
     }

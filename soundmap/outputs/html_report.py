@@ -1,0 +1,267 @@
+"""``report.html``: one page that tells a run, or a difference of two, to whoever opens it.
+
+The page holds everything itself: pictures, style, no script. It needs no network and asks for none.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from typing import Any
+
+import tomli_w
+
+from soundmap.outputs.level_plot import level_plot
+
+CAPTIONS = {
+    "power_map": "Where it is loud: mean emitted power over the geometric map. Cells without "
+    "colour were not measured, or too rarely to count; they need not be quiet.",
+    "trajectory": "Where the robot was: its way in the geometric map, with the sources found.",
+    "audio_scans": "What the array heard: level on every bearing over time, and below it the "
+    "level of the loudest bearing and the mean of all.",
+    "power_ratio": "What changed: red is louder than the background, blue is quieter, no colour "
+    "was not measured.",
+}
+HEADINGS = {
+    "id": "Source",
+    "x_m": "x [m]",
+    "y_m": "y [m]",
+    "power_db": "Level [dB]",
+    "ratio_db": "Louder by [dB]",
+    "visits": "Visits",
+}
+NOTHING = "-"
+HIDDEN = {"power_reference"}
+STYLE = """
+:root { color-scheme: light; }
+* { box-sizing: border-box; }
+body { font: 16px/1.45 system-ui, sans-serif; color: #1a1a1a; background: #fff;
+  max-width: 62rem; margin: 0 auto; padding: 1rem; }
+h1 { font-size: 1.6rem; line-height: 1.2; margin: 0 0 .3rem; overflow-wrap: anywhere; }
+h2 { font-size: 1.15rem; margin: 2rem 0 .6rem; border-bottom: 1px solid #ccc; }
+.lead { font-size: 1.15rem; margin: .2rem 0 1rem; }
+.facts { display: flex; flex-wrap: wrap; gap: .6rem; margin: 1rem 0; padding: 0; list-style: none; }
+.facts li { flex: 1 1 9rem; border: 1px solid #ccc; border-radius: .4rem; padding: .5rem .7rem; }
+.facts b { display: block; font-size: 1.25rem; overflow-wrap: anywhere; }
+.facts .warn { border-color: #d55e00; background: #fdf1e8; }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; min-width: 18rem; }
+th, td { padding: .3rem .7rem .3rem 0; text-align: left; vertical-align: top;
+  border-bottom: 1px solid #e4e4e4; }
+td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
+figure { margin: 1rem 0; }
+img, svg { display: block; max-width: 100%; height: auto; }
+figcaption { color: #444; font-size: .95rem; margin-top: .3rem; max-width: 45rem; }
+pre { font-size: .8rem; white-space: pre-wrap; overflow-wrap: anywhere; columns: 20rem;
+  background: #f6f6f6; padding: .8rem; margin: .5rem 0; }
+summary { cursor: pointer; }
+dl { display: grid; grid-template-columns: max-content 1fr; gap: .2rem 1rem; margin: 0; }
+dt { color: #555; } dd { margin: 0; overflow-wrap: anywhere; }
+@media print {
+  body { font-size: 10.5pt; max-width: none; padding: 0; }
+  figure, tr, li { break-inside: avoid; } h2 { break-after: avoid; }
+  figure img { max-height: 21cm; width: auto; }
+  .wide { overflow: visible; }
+  details::details-content { content-visibility: visible; display: block; block-size: auto; }
+}
+"""
+
+
+def report_html(report: Mapping[str, Any], pictures: Mapping[str, bytes]) -> str:
+    """The page of a run folder or a diff folder.
+
+    Parameters
+    ----------
+    report : mapping
+        As in ``report.json``.
+    pictures : mapping
+        PNG or SVG by name, in the order in which they are shown; may be empty.
+    """
+    compares = "background" in report
+    title = f"{report['run']} against {report['background']}" if compares else report["log"]
+    parts = [
+        f"<h1>{escape(title)}</h1>",
+        f'<p class="lead">{escape(_lead(report, compares=compares))}</p>',
+        _facts(_run_facts(report) if not compares else _diff_facts(report)),
+        *(_figure(name, content) for name, content in list(pictures.items())[:1]),
+        _section("Places that are louder" if compares else "Sources", _sources(report)),
+        *(_figure(name, content) for name, content in list(pictures.items())[1:]),
+        *([] if compares else [_section("What was lost", _losses(report["losses"]))]),
+        _section("How it was made", _provenance(report)),
+        _section("Configuration", _configuration(report["config"])),
+    ]
+    return _page(title, "\n".join(parts))
+
+
+def _page(title: str, body: str) -> str:
+    policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        '<link rel="icon" href="data:,">\n'
+        f"<title>{escape(title)} · soundmap</title>\n<style>{STYLE}</style>\n</head>\n"
+        f"<body>\n{body}\n</body>\n</html>\n"
+    )
+
+
+def _lead(report: Mapping[str, Any], *, compares: bool) -> str:
+    rows = report["sources"]
+    if not rows:
+        return "No place is louder than before." if compares else "No source was found."
+    first, count = rows[0], len(rows)
+    place = f"at x {first['x_m']:.2f} m, y {first['y_m']:.2f} m"
+    if compares:
+        many = "One place is" if count == 1 else f"{count} places are"
+        return f"{many} louder than before; most of all {first['id']} {place}."
+    many = "One source was found" if count == 1 else f"{count} sources were found"
+    return f"{many}; the loudest, {first['id']}, {place}."
+
+
+def _run_facts(report: Mapping[str, Any]) -> list[tuple[str, str, bool]]:
+    way, rows = report["trajectory"], report["sources"]
+    lost = sum(loss["data_lost"] for loss in report["losses"])
+    share = way["usable_share"]
+    level = _number(rows[0]["power_db"], 1) if rows else NOTHING
+    return [
+        (level, _printed(report["level_reference"]) + ", loudest source", False),
+        (str(len(rows)), "sources", False),
+        (
+            NOTHING if share is None else f"{100 * share:.1f} %",
+            "of the poses can be trusted",
+            share is None or share < 0.95,
+        ),
+        (f"{way['length_m']:.1f} m", f"driven in {_number(report['duration_s'], 1)} s", False),
+        (str(lost) if lost else "none", "kinds of data lost", lost > 0),
+    ]
+
+
+def _diff_facts(report: Mapping[str, Any]) -> list[tuple[str, str, bool]]:
+    rows, counts = report["sources"], report["counts"]
+    without = counts.get("cells_without_background", 0)
+    return [
+        (
+            f"{_number(rows[0]['ratio_db'], 1)} dB" if rows else NOTHING,
+            "greatest difference",
+            False,
+        ),
+        (str(len(rows)), "places louder", False),
+        (str(counts.get("cells_compared", 0)), "cells compared", False),
+        (str(without), "of them against the background's median", without > 0),
+    ]
+
+
+def _facts(facts: Sequence[tuple[str, str, bool]]) -> str:
+    items = (
+        f"<li{' class=warn' if warns else ''}><b>{escape(value)}</b>{escape(what)}</li>"
+        for value, what, warns in facts
+    )
+    return f'<ul class="facts">{"".join(items)}</ul>'
+
+
+def _figure(name: str, content: bytes) -> str:
+    kind = "image/png" if content.startswith(b"\x89PNG") else "image/svg+xml"
+    caption = escape(CAPTIONS.get(name, name))
+    data = base64.b64encode(content).decode("ascii")
+    image = f'<img src="data:{kind};base64,{data}" alt="{caption}">'
+    return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"
+
+
+def _sources(report: Mapping[str, Any]) -> str:
+    rows = report["sources"]
+    if not rows:
+        return "<p>None.</p>"
+    columns = [column for column in rows[0] if column not in HIDDEN]
+    reference = report.get("level_reference")
+    note = f"<p>Levels are in {escape(_printed(reference))}.</p>" if reference else ""
+    head = [HEADINGS.get(column, column) for column in columns]
+    cells = [[_cell(row.get(column)) for column in columns] for row in rows]
+    level = "power_db" if "power_db" in rows[0] else "ratio_db"
+    return level_plot(rows, level, _printed(reference or "dB")) + note + _table(head, cells)
+
+
+def _losses(losses: Sequence[Mapping[str, Any]]) -> str:
+    if not losses:
+        return "<p>Nothing was lost.</p>"
+    rows = [
+        [
+            "lost" if loss["data_lost"] else "note",
+            str(loss["count"]),
+            loss["what"],
+            loss["where"],
+            loss["effect"],
+        ]
+        for loss in losses
+    ]
+    return _table(["", "Times", "What", "Where", "What was done"], rows)
+
+
+def _provenance(report: Mapping[str, Any]) -> str:
+    facts = {"soundmap": report["soundmap"]}
+    for key in ("log", "run", "background", "fingerprint"):
+        if report.get(key) is not None:
+            facts[_words(key)] = str(report[key])
+    if report.get("duration_s") is not None:
+        facts["length of the log"] = f"{_number(report['duration_s'], 1)} s"
+    if report.get("speed") is not None:
+        facts["speed"] = f"{report['speed']:.3g} x real time"
+    facts["time"] = _joined(
+        f"{_words(k)} {_number(v, 2)} s" for k, v in report["timings_s"].items()
+    )
+    facts["counts"] = _joined(f"{v} {_words(k)}" for k, v in report["counts"].items())
+    facts["versions"] = _joined(f"{k} {v}" for k, v in report["versions"].items())
+    return _definitions(facts)
+
+
+def _configuration(config: Mapping[str, Any]) -> str:
+    text = escape(tomli_w.dumps(config))
+    return f"<details><summary>Every setting, as used</summary><pre>{text}</pre></details>"
+
+
+def _section(title: str, content: str) -> str:
+    return f"<section><h2>{escape(title)}</h2>{content}</section>"
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    numeric = [all(_is_number(row[i]) for row in rows) for i in range(len(head))]
+    marks = [' class="n"' if number else "" for number in numeric]
+    titles = "".join(f"<th{m}>{escape(t)}</th>" for m, t in zip(marks, head, strict=True))
+    lines = "".join(
+        "<tr>"
+        + "".join(f"<td{m}>{escape(c)}</td>" for m, c in zip(marks, row, strict=True))
+        + "</tr>"
+        for row in rows
+    )
+    return f'<div class="wide"><table><tr>{titles}</tr>{lines}</table></div>'
+
+
+def _definitions(facts: Mapping[str, str]) -> str:
+    lines = (f"<dt>{escape(k)}</dt><dd>{escape(v)}</dd>" for k, v in facts.items() if v)
+    return f"<dl>{''.join(lines)}</dl>"
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return NOTHING if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _number(value: float | None, decimals: int) -> str:
+    return NOTHING if value is None else f"{value:.{decimals}f}"
+
+
+def _is_number(text: str) -> bool:
+    return text == NOTHING or text.replace(".", "", 1).replace("-", "", 1).isdigit()
+
+
+def _joined(parts: Iterable[str]) -> str:
+    return ", ".join(parts)
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _printed(reference: str) -> str:
+    return reference.replace("^2", "²").replace("uPa", "µPa")

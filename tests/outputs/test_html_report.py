@@ -1,0 +1,139 @@
+import re
+from html.parser import HTMLParser
+
+import pytest
+from handmade import made_ratio, made_run, unlucky_run
+
+from soundmap.config import DiffConfig
+from soundmap.outputs.html_report import report_html
+from soundmap.outputs.level_plot import level_plot
+from soundmap.outputs.report import diff_report, run_report
+
+PICTURES = {"power_map": b"\x89PNG first", "trajectory": b"<?xml second"}
+VOID = {"meta", "link", "img", "circle", "line"}
+
+
+class Page(HTMLParser):
+    """Checks that tags close in order, and keeps what a reader sees and what a browser loads."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.text: list[str] = []
+        self.loads: list[str] = []
+        self.tags: set[str] = set()
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.add(tag)
+        self.loads += [value for name, value in attrs if name in ("src", "href", "action", "data")]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags.add(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if "style" not in self.open:
+            self.text.append(data)
+
+    def says(self, *words: str) -> bool:
+        said = " ".join(" ".join(self.text).split())
+        return all(word in said for word in words)
+
+
+def page_of(run) -> Page:
+    return Page(report_html(run_report(run, run.timings_s), PICTURES))
+
+
+def test_the_page_says_what_was_found_what_was_lost_and_how_it_was_made():
+    page = page_of(made_run())
+    assert page.says("2 sources were found; the loudest, S1, at x 3.12 m, y 0.28 m.")
+    assert page.says("S2", "5.7251", "-63.979", "dB re (full scale)²")
+    assert page.says("90.0 %", "of the poses can be trusted")
+    assert page.says("1294", "odometry pose is not finite", "motion taken from the twist")
+    assert page.says("numpy", "localize 1.25 s", "min_visit_share = 0.1", "0123abcd")
+
+
+def test_the_page_loads_nothing_but_itself():
+    page = page_of(made_run())
+    assert page.loads
+    assert all(link.startswith("data:") for link in page.loads)
+    assert not page.tags & {"script", "iframe", "object", "form", "audio", "video"}
+    text = report_html(run_report(made_run(), {}), PICTURES)
+    assert "default-src 'none'" in text
+    assert not re.search(r"@import|url\(", text)
+
+
+def test_pictures_are_shown_in_their_format():
+    text = report_html(run_report(made_run(), {}), PICTURES)
+    kinds = re.findall(r'<img src="data:(image/[a-z+]+);base64,', text)
+    assert kinds == ["image/png", "image/svg+xml"]
+
+
+def test_a_run_without_sources_pictures_or_losses_has_a_whole_page_too():
+    run = unlucky_run()
+    page = Page(report_html(run_report(run, {}), {}))
+    assert page.says("No source was found.", "Nothing was lost.")
+    assert "svg" not in page.tags
+    assert "img" not in page.tags
+
+
+def test_names_from_a_log_are_shown_not_obeyed():
+    run = made_run(made_run().log.with_name("<script>alert(1)<br>&amp;.mcap"))
+    page = page_of(run)
+    assert "script" not in page.tags
+    assert page.says("&amp;.mcap")
+
+
+def test_a_difference_has_a_page(tmp_path):
+    report = diff_report(
+        made_ratio(),
+        run=tmp_path / "run1",
+        background=tmp_path / "run3",
+        config=DiffConfig(),
+        timings_s={"compare": 0.1},
+    )
+    page = Page(report_html(report, {"power_ratio": b"\x89PNG"}))
+    assert page.says("run1 against run3", "2 places are louder than before; most of all S1")
+    assert page.says("against the background's median", "26.02")
+
+
+def circles(svg: str) -> list[float]:
+    return [float(x) for x in re.findall(r'<circle cx="([0-9.]+)"', svg)]
+
+
+def test_the_dots_stand_where_the_scale_says():
+    rows = [{"id": "S1", "power_db": 52.0}, {"id": "S2", "power_db": 46.0}]
+    svg = level_plot(rows, "power_db", "dB")
+    ticks = {
+        float(value): float(x)
+        for x, value in re.findall(r'<text x="([0-9.]+)"[^>]*middle">(-?[0-9.]+)</text>', svg)
+    }
+    assert circles(svg) == pytest.approx([ticks[52.0], ticks[46.0]], abs=0.1)
+
+
+def test_a_known_error_is_drawn_to_both_sides_of_its_level():
+    row = {"id": "S1", "power_db": 50.0, "power_std_db": 2.0}
+    svg = level_plot([row], "power_db", "dB")
+    start, end = map(float, re.search(r'<line x1="([0-9.]+)" x2="([0-9.]+)" y1="14"', svg).groups())
+    assert (start + end) / 2 == pytest.approx(circles(svg)[0], abs=0.1)
+    assert end - start > 10
+    assert "50.0 ± 2.0 dB" in svg
+
+
+def test_a_level_that_is_not_known_has_no_dot():
+    assert level_plot([{"id": "S1", "power_db": None}], "power_db", "dB") == ""
+    assert level_plot([], "power_db", "dB") == ""
+
+
+def test_many_sources_are_cut_short_and_said_so():
+    rows = [{"id": f"S{n}", "power_db": -float(n)} for n in range(30)]
+    svg = level_plot(rows, "power_db", "dB")
+    assert len(circles(svg)) == 20
+    assert "and 10 more" in svg
