@@ -19,7 +19,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from soundmap.geometry import FloatArray, composed, relative
-from soundmap.mapping.key_scans import KeyScan
+from soundmap.mapping.key_scans import STRIP_M, KeyScan
 
 SIGMA_M = 0.03
 """Standard deviation of a residual [m]: range noise of usual scanners."""
@@ -40,7 +40,7 @@ class PointStore:
     Attributes
     ----------
     end_m, normal : ndarray of float32, shapes (P, 2)
-        In the base frame of their scan, ordered by x within it.
+        In the base frame of their scan, in `strip_order` within it.
     first : ndarray of int64, shape (K + 1,)
         Scan k owns the returns first[k] to first[k + 1].
     """
@@ -77,7 +77,12 @@ class PairFits:
 
 
 def pair_fits(
-    store: PointStore, pose: FloatArray, pairs: NDArray[np.int64], *, gate_m: float
+    store: PointStore,
+    pose: FloatArray,
+    pairs: NDArray[np.int64],
+    *,
+    gate_m: float,
+    stride: int = 1,
 ) -> PairFits:
     """Normal equations of each pair of scans at the given poses.
 
@@ -90,13 +95,15 @@ def pair_fits(
         Returns of the first scan are matched to surfaces of the second.
     gate_m : float
         Returns farther apart than this do not belong together [m].
+    stride : int
+        Only every so many-th return is matched, and counts so many times.
     """
     between = relative(pose[pairs[:, 1]], pose[pairs[:, 0]])
     information, gradient, matched = _pair_equations(
-        store.end_m, store.normal, store.first, np.ascontiguousarray(between), pairs, gate_m
+        store.end_m, store.normal, store.first, np.ascontiguousarray(between), pairs, gate_m, stride
     )
-    scale = CORRELATION / SIGMA_M**2
-    return PairFits(information * scale, gradient * scale, matched)
+    scale = stride * CORRELATION / SIGMA_M**2
+    return PairFits(information * scale, gradient * scale, stride * matched)
 
 
 @dataclass(frozen=True)
@@ -196,25 +203,47 @@ def nearest_return(
     facing: tuple[float, float],
     gate: float,
 ) -> int:
-    """Index of the nearest return, among those ordered by x, whose surface faces the same way."""
+    """Index of the nearest return, of those from first to last, whose surface faces the same way.
+
+    -1 if none lies within the gate. The strip of the point is searched first; its neighbours
+    seldom hold anything nearer.
+    """
     x, y = point
-    low, high = first, last
-    while low < high:
-        middle = (low + high) // 2
-        if end[middle, 0] < x - gate:
-            low = middle + 1
-        else:
-            high = middle
     best, nearest = gate * gate, -1
-    for k in range(low, last):
-        dx = end[k, 0] - x
-        if dx > gate:
-            break
-        dy = end[k, 1] - y
-        square = dx * dx + dy * dy
-        if square < best and normal[k, 0] * facing[0] + normal[k, 1] * facing[1] > SAME_SIDE:
-            best, nearest = square, k
+    middle = int(np.floor(y / STRIP_M))
+    reach = int(np.ceil(gate / STRIP_M))
+    for offset in range(2 * reach + 1):
+        strip = middle + ((offset + 1) // 2 if offset % 2 else -(offset // 2))
+        away = max(strip * STRIP_M - y, y - (strip + 1) * STRIP_M, 0.0)
+        if away * away >= best:
+            continue
+        width = np.sqrt(best - away * away)
+        k = _first_beyond(end, first, last, strip, x - width)
+        top = (strip + 1) * STRIP_M
+        while k < last:
+            dx, dy = end[k, 0] - x, end[k, 1] - y
+            if dx > width or end[k, 1] >= top:
+                break
+            square = dx * dx + dy * dy
+            same = normal[k, 0] * facing[0] + normal[k, 1] * facing[1] > SAME_SIDE
+            if square < best and same:
+                best, nearest = square, k
+            k += 1
     return nearest
+
+
+@njit(cache=True, nogil=True)
+def _first_beyond(end: NDArray[np.float32], first: int, last: int, strip: int, x: float) -> int:
+    """Index of the first return in a strip that is not left of x, or of one after the strip."""
+    bottom = strip * STRIP_M
+    while first < last:
+        middle = (first + last) // 2
+        y = end[middle, 1]
+        if y < bottom or (y < bottom + STRIP_M and end[middle, 0] < x):
+            first = middle + 1
+        else:
+            last = middle
+    return first
 
 
 @njit(cache=True, nogil=True)
@@ -225,6 +254,7 @@ def _pair_equations(
     between: FloatArray,
     pairs: NDArray[np.int64],
     gate: float,
+    stride: int,
 ) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
     information = np.zeros((len(pairs), 3, 3))
     gradient = np.zeros((len(pairs), 3))
@@ -233,7 +263,7 @@ def _pair_equations(
         i, j = pairs[m]
         zx, zy, turn = between[m]
         cos, sin = np.cos(turn), np.sin(turn)
-        for k in range(first[i], first[i + 1]):
+        for k in range(first[i], first[i + 1], stride):
             if normal[k, 0] == 0.0 and normal[k, 1] == 0.0:
                 continue
             rx = cos * end[k, 0] - sin * end[k, 1]

@@ -29,7 +29,7 @@ from soundmap.sensors import LaserScan
 LOOP_EVERY_M = 0.5
 """Way between two searches for loops."""
 FIRST_GATES_M = (0.4, 0.3, 0.2)
-LAST_GATES_M = (0.25, 0.2, 0.15, 0.15, 0.12, 0.12, 0.10, 0.10, 0.10)
+LAST_GATES_M = (0.25, 0.2, 0.15, 0.12, 0.12, 0.10, 0.10, 0.10)
 RARE_NS = 200_000_000
 """Where laser scans are farther apart, the trajectory has the poses of the odometry as well."""
 GROWING, RELAXING = 0.7, 0.3

@@ -32,13 +32,25 @@ BODY_LEAST_SCANS = 20
 """... if so many scans ..."""
 BODY_LEAST_WAY_M = 2.0
 """... were taken over at least this way."""
+STRIP_M = 0.25
 
 Float32Array = NDArray[np.float32]
 
 
+def strip_order(points: Float32Array) -> NDArray[np.int64]:
+    """Order in which points near a place are found fast: by strips along x, by x within a strip.
+
+    Parameters
+    ----------
+    points : ndarray of float32, shape (P, 2)
+        [m]
+    """
+    return np.lexsort((points[:, 0], np.floor(points[:, 1] / STRIP_M)))
+
+
 @dataclass(frozen=True)
 class KeyScan:
-    """One laser scan of which the map is made. Returns are ordered by x.
+    """One laser scan of which the map is made. Returns are in `strip_order`.
 
     Attributes
     ----------
@@ -215,9 +227,10 @@ def _thinned(rays: Rays, most: int, spacing_m: float) -> dict[str, Float32Array]
     kept = np.sort(first)
     if len(kept) > most:
         kept = kept[(np.arange(most) * len(kept) + len(kept) // 2) // most]
-    kept = kept[np.argsort(rays.end_m[kept, 0], kind="stable")]
+    end = rays.end_m.astype(np.float32)
+    kept = kept[strip_order(end[kept])]
     return {
         "origin_m": rays.origin_m[kept].astype(np.float32),
-        "end_m": rays.end_m[kept].astype(np.float32),
+        "end_m": end[kept],
         "normal": normal[kept].astype(np.float32),
     }

@@ -18,7 +18,7 @@ from soundmap.geometry import FloatArray, relative, transformed
 from soundmap.mapping.alignment import PointStore, aligned_scan, pair_fits
 from soundmap.mapping.correlation import best_placement, nearness_grid
 from soundmap.mapping.growing_graph import GrowingGraph
-from soundmap.mapping.key_scans import KeyScan
+from soundmap.mapping.key_scans import KeyScan, strip_order
 from soundmap.mapping.links import scan_links
 from soundmap.mapping.pose_graph import Links, link_costs, solved_graph
 
@@ -197,9 +197,9 @@ def recent_view(graph: GrowingGraph, scan: int) -> KeyScan:
         end.append(transformed(pose, other.end_m))
         origin.append(transformed(pose, other.origin_m))
         normal.append(transformed(np.array([0.0, 0.0, pose[2]]), other.normal))
-    ends = np.concatenate(end)
+    ends = np.concatenate(end).astype(np.float32)
     kept = _spaced_index(ends, 0.5 * QUERY_SPACING_M)
-    kept = kept[np.argsort(ends[kept, 0], kind="stable")]
+    kept = kept[strip_order(ends[kept])]
     last = graph.scans[scan]
     return KeyScan(
         last.time_ns,
@@ -208,7 +208,7 @@ def recent_view(graph: GrowingGraph, scan: int) -> KeyScan:
         last.driven_m,
         last.turned_rad,
         np.concatenate(origin)[kept].astype(np.float32),
-        ends[kept].astype(np.float32),
+        ends[kept],
         np.concatenate(normal)[kept].astype(np.float32),
     )
 

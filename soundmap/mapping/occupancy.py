@@ -20,6 +20,8 @@ MARGIN_M = 0.5
 SURFACE_CELLS = 1.0
 """Rays say nothing about cells this near to the surface that they meet, but the last."""
 MOST_GRAZING_CELLS = 10.0
+UNDER_ROBOT_M = 0.1
+SHORT_STEP_M = 1.0
 
 
 def map_frame(scans: Sequence[KeyScan], pose: FloatArray, *, cell_m: float) -> GridFrame:
@@ -66,7 +68,28 @@ def drawn_map(
     hits, misses = ray_counts(scans, pose, frame)
     seen = hits + misses
     occupied = (hits > 0) & (hits >= occupied_share * seen)
-    return OccupancyGrid(frame, occupied, (seen > 0) & ~occupied)
+    free = ((seen > 0) | stood_on(pose, frame)) & ~occupied
+    return OccupancyGrid(frame, occupied, free)
+
+
+def stood_on(pose: FloatArray, frame: GridFrame) -> NDArray[np.bool_]:
+    """Cells under the middle of the robot, which no ray need pass, shape (H, W).
+
+    The way from one pose to the next is taken as straight where it is short.
+    """
+    reach = np.arange(-UNDER_ROBOT_M, UNDER_ROBOT_M + 1e-9, 0.5 * frame.resolution_m)
+    x, y = np.meshgrid(reach, reach)
+    disc = np.stack([x, y], axis=-1)[np.hypot(x, y) <= UNDER_ROBOT_M]
+    start, step = pose[:-1, :2], np.diff(pose[:, :2], axis=0)
+    short = np.hypot(step[:, 0], step[:, 1]) < SHORT_STEP_M
+    share = np.linspace(0.0, 1.0, int(SHORT_STEP_M / UNDER_ROBOT_M) + 1)
+    way = start[short, None] + share[:, None] * step[short, None]
+    under = np.zeros(frame.shape, dtype=np.bool_)
+    for points in (pose[:, :2], way.reshape(-1, 2)):
+        for offset in disc:
+            cells = frame.cells(points + offset)
+            under[cells[:, 0], cells[:, 1]] = True
+    return under
 
 
 @njit(cache=True, nogil=True)

@@ -24,6 +24,8 @@ LEAST_MATCHED = 20
 LEAST_SHARE = 0.25
 """Scans overlap if this share of the smaller one's returns meets the other's surfaces."""
 ROBUST_SCALE = 4.0
+FINE_ROUNDS = 3
+"""The last rounds use all returns, those before every other one."""
 
 
 def overlapping_pairs(pose: FloatArray, neighbours: int) -> NDArray[np.int64]:
@@ -85,7 +87,8 @@ def relaxed_poses(
         if len(pairs) == 0:
             return pose, odometry
         both = np.concatenate([pairs, pairs[:, ::-1]])
-        fits = pair_fits(store, pose, both, gate_m=gate)
+        coarse = number < len(gates_m) - FINE_ROUNDS
+        fits = pair_fits(store, pose, both, gate_m=gate, stride=2 if coarse else 1)
         enough = np.maximum(LEAST_MATCHED, LEAST_SHARE * size[both].min(axis=1))
         overlap = fits.matched >= enough
         kept = PairFits(fits.information[overlap], fits.gradient[overlap], fits.matched[overlap])
