@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from soundmap import __version__, cli_runs
+from soundmap import __version__, cli_map, cli_runs
 from soundmap.errors import DataLossError, SoundmapError
 from soundmap.outputs.picture_format import PictureFormat
 from soundmap.terminal import (
@@ -184,6 +184,7 @@ def process(
     _exit_unless_good(outcomes, strict=strict)
 
 
+app.command("map")(cli_map.map_log)
 app.command()(cli_runs.diff)
 app.command()(cli_runs.evaluate)
 

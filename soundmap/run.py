@@ -56,3 +56,43 @@ class Run:
     counts: dict[str, int]
     timings_s: dict[str, float]
     duration_s: float
+
+
+@dataclass(frozen=True)
+class MapRun:
+    """The results of ``soundmap map`` for one log.
+
+    Attributes
+    ----------
+    log : Path
+        The log as the user named it.
+    fingerprint : str
+        Identifies the log's content.
+    config : Config
+        As resolved.
+    room : OccupancyGrid
+        The geometric map built (Sect. 2.1), with its origin at the first pose.
+    trajectory : Trajectory
+        Base frame in the map frame.
+    facts : dict
+        How the map came about: loops, residuals, errors of the odometry, by name.
+    losses : tuple of Loss
+        What had to be left out.
+    counts : dict
+        How much of what was used, by name.
+    timings_s : dict
+        Wall time of each stage [s].
+    duration_s : float
+        Time from the first to the last message of the log [s].
+    """
+
+    log: Path
+    fingerprint: str
+    config: Config
+    room: OccupancyGrid
+    trajectory: Trajectory
+    facts: dict[str, float]
+    losses: tuple[Loss, ...]
+    counts: dict[str, int]
+    timings_s: dict[str, float]
+    duration_s: float

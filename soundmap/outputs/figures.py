@@ -27,10 +27,17 @@ Places = Sequence[tuple[float, float]]
 
 def trajectory_figure(run: Run) -> Figure:
     """Fig. 2: geometric map, way of the robot, sources."""
-    trajectory = run.trajectory
     places = [(source.x_m, source.y_m) for source in run.sources]
-    area = area_of_interest([trajectory.pose[:, :2], _points(places)], run.room)
-    plan = FloorPlan(area, run.room, f"{run.log.stem}: geometric map and trajectory")
+    title = f"{run.log.stem}: geometric map and trajectory"
+    return map_figure(run.room, run.trajectory, title, places=places)
+
+
+def map_figure(
+    room: OccupancyGrid, trajectory: Trajectory, title: str, *, places: Places = ()
+) -> Figure:
+    """Fig. 2: geometric map and way of the robot, with places if there are any."""
+    area = area_of_interest([trajectory.pose[:, :2], _points(places)], room)
+    plan = FloorPlan(area, room, title)
     _draw_trajectory(plan.axes, trajectory)
     plan.draw_places(places)
     return plan.finished()

@@ -38,14 +38,14 @@ def run_report(run: Run, timings_s: Mapping[str, float]) -> dict[str, Any]:
     """
     spent = sum(timings_s.values())
     return {
-        **_provenance(),
+        **provenance(),
         "log": run.log.name,
         "fingerprint": run.fingerprint,
         "duration_s": run.duration_s,
         "speed": run.duration_s / spent if spent > 0 else None,
         "level_reference": str(run.sources.reference),
         "sources": source_rows(run.sources),
-        "trajectory": _trajectory_summary(run.trajectory),
+        "trajectory": trajectory_summary(run.trajectory),
         "counts": dict(run.counts),
         "losses": [dataclasses.asdict(loss) for loss in run.losses],
         "timings_s": dict(timings_s),
@@ -64,7 +64,7 @@ def diff_report(
     """Everything about a comparison of two runs but its arrays."""
     measured = np.isfinite(ratio.ratio_db)
     return {
-        **_provenance(),
+        **provenance(),
         "run": run.resolve().name,
         "background": background.resolve().name,
         "sources": change_rows(ratio.changes),
@@ -136,14 +136,16 @@ def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _provenance() -> dict[str, Any]:
+def provenance() -> dict[str, Any]:
+    """Versions of the program, of what it writes, and of what it was made with."""
     versions = {"python": platform.python_version()}
     for library in LIBRARIES:
         versions[library] = importlib.metadata.version(library)
     return {"schema_version": SCHEMA_VERSION, "soundmap": __version__, "versions": versions}
 
 
-def _trajectory_summary(trajectory: Trajectory) -> dict[str, Any]:
+def trajectory_summary(trajectory: Trajectory) -> dict[str, Any]:
+    """Number of poses, way driven [m], and the share of poses to be trusted."""
     steps = np.diff(trajectory.pose[:, :2], axis=0)
     return {
         "poses": len(trajectory),

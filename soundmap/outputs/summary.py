@@ -61,6 +61,33 @@ def diff_view(report: Mapping[str, Any]) -> RenderableType:
     )
 
 
+def map_view(report: Mapping[str, Any]) -> RenderableType:
+    """Map, odometry, losses, time and files of a map that was built."""
+    spent_s = sum(report["timings_s"].values())
+    speed = f", {report['speed']:.3g} x real time" if report["speed"] else ""
+    way, room = report["trajectory"], report["map"]
+    millimetres, degrees = 1e3 * room["residual_m"], math.degrees(room["residual_rad"])
+    return Group(
+        Text(f"{report['log']}: {report['duration_s']:.1f} s of log in {spent_s:.1f} s{speed}"),
+        _lines(
+            {
+                "Map": f"{room['columns']} x {room['rows']} cells of {room['resolution_m']:g} m, "
+                f"{room['free_m2']:.0f} m² free",
+                "Trajectory": f"{way['length_m']:.2f} m, {way['poses']} poses",
+                "Loops": f"{room['loops_closed']} closed of {room['loops_recognised']} recognised",
+                "Agreement": f"pairs of scans within {millimetres:.1f} mm, {degrees:.2f} degrees",
+                "Odometry": f"distance x {room['odometry_distance_scale']:.4f}, turn "
+                f"x {room['odometry_turn_scale']:.4f}, "
+                f"{math.degrees(room['odometry_turn_per_metre']):+.2f} degrees a metre",
+                "Used": ", ".join(f"{count} {_words(name)}" for name, count in _counts(report)),
+                "Time": _times(report["timings_s"]),
+                "Files": f"{report['folder']}/",
+            }
+        ),
+        *_losses(report["losses"]),
+    )
+
+
 def log_view(summary: Mapping[str, Any]) -> RenderableType:
     """What a log holds and what of it would be used, from the summary's plain form."""
     topics = _table("topic", align_right=("messages", "rate [Hz]"), left=("schema", "used as"))
