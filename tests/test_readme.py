@@ -12,7 +12,7 @@ from soundmap.cli import app
 
 TOP = Path(__file__).parents[1]
 README = (TOP / "README.md").read_text(encoding="utf-8")
-CITED = {"Eq. (1)", "Eq. (2)", "Eq. (3)", "Eq. (4)", "Eq. (5)", "Table 1"}
+CITED = {"Eq. (1)", "Eq. (2)", "Eq. (3)", "Eq. (4)", "Eq. (5)", "Table 1", "Table 2"}
 
 
 def index_rows() -> list[tuple[str, str]]:
@@ -109,11 +109,22 @@ def test_the_configuration_shown_is_valid(tmp_path):
 
 def test_the_commands_shown_are_understood():
     commands = re.findall(r"^soundmap (\w+) (.*?)(?: +#.*)?$", README, flags=re.MULTILINE)
-    assert {name for name, _ in commands} == {"info", "process", "diff"}
+    assert {name for name, _ in commands} >= {"info", "process", "diff", "simulate", "evaluate"}
     for name, arguments in commands:
         text = CliRunner().invoke(app, [name, "--help"]).stdout
         for option in re.findall(r"--[\w-]+", arguments):
             assert f"{option} " in text, (name, option)
+
+
+def test_the_first_command_processes_a_log_that_is_there():
+    command = re.findall(r"\.venv/bin/soundmap process (.*)\n", README)[0]
+    files = [word for word in command.split() if not word.startswith("--")]
+    assert files
+    assert all((TOP / file).is_file() for file in files)
+
+
+def test_the_pictures_shown_are_there():
+    assert all((TOP / file).is_file() for file in re.findall(r'src="([^"]+)"', README))
 
 
 def test_the_checks_that_machines_run_are_those_that_the_readme_names():
