@@ -6,6 +6,7 @@ scans are relaxed together, and the rays of the relaxed scans are drawn.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
@@ -30,6 +31,8 @@ LOOP_EVERY_M = 0.5
 """Way between two searches for loops."""
 FIRST_GATES_M = (0.4, 0.3, 0.2)
 LAST_GATES_M = (0.25, 0.2, 0.15, 0.12, 0.12, 0.10, 0.10, 0.10)
+FIRST_LEARNT_M = 8.0
+"""Way after which the errors of the odometry are learnt; then each time it has grown by half."""
 RARE_NS = 200_000_000
 """Where laser scans are farther apart, the trajectory has the poses of the odometry as well."""
 GROWING, RELAXING = 0.7, 0.3
@@ -166,9 +169,12 @@ def _grown(
 ) -> LoopSearch:
     """Add all scans, closing loops on the way."""
     search = LoopSearch()
-    distance, searched_m = np.zeros(1), 0.0
+    distance, searched_m, learn_m = np.zeros(1), 0.0, FIRST_LEARNT_M
     for new in range(1, len(graph.scans)):
         graph.add_next(distance)
+        if graph.scans[new].driven_m > learn_m:
+            learn_m *= 1.5
+            graph.adopt(_learnt_model(graph))
         step = float(np.hypot(*(graph.pose[new, :2] - graph.pose[new - 1, :2])))
         distance = np.append(distance + step, 0.0)
         driven_m = graph.scans[new].driven_m
@@ -181,6 +187,17 @@ def _grown(
             search += outcome
         report(GROWING * new / len(graph.scans))
     return search
+
+
+def _learnt_model(graph: GrowingGraph) -> OdometryModel:
+    """Systematic errors of the odometry so far; its noise is not yet believed to be small."""
+    fitted = _fitted_model(graph.scans[: graph.count], graph.pose, graph.model)
+    return dataclasses.replace(
+        fitted,
+        noise_distance_per_metre=max(fitted.noise_distance_per_metre, 0.03),
+        noise_turn_per_metre=max(fitted.noise_turn_per_metre, 0.02),
+        noise_turn_per_turn=max(fitted.noise_turn_per_turn, 0.03),
+    )
 
 
 def _searched_again(graph: GrowingGraph, config: MappingConfig) -> LoopSearch:

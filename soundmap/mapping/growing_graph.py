@@ -73,6 +73,11 @@ class GrowingGraph:
         chain = Links(odometry.pairs[:done], odometry.measured[:done], odometry.information[:done])
         return Links.joined([chain, *self._scan_links])
 
+    def adopt(self, model: OdometryModel) -> None:
+        """Take a better model of the odometry, for the way done and the way to come."""
+        self.model = model
+        self._odometry_links = odometry_links(self.scans, model)
+
     def add_links(self, links: Links) -> None:
         """Add links between scans added."""
         self._scan_links.append(links)

@@ -13,7 +13,7 @@ from soundmap.mapping.key_scans import KeyScan
 from soundmap.mapping.odometry_model import OdometryModel
 from soundmap.mapping.pose_graph import Links
 
-PAIR_SIGMA = np.array([0.015, 0.015, np.radians(0.4)])
+PAIR_SIGMA = np.array([0.01, 0.01, np.radians(0.2)])
 """No two scans tell their relative pose better than this [m, m, rad]: mounts, tilt, timing."""
 WEAKEST = 1.0
 """Information added where surfaces say nothing, so that a corridor stays loose but solvable."""

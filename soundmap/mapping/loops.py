@@ -27,8 +27,10 @@ GAP_M = 10.0
 NEAR_M = 3.0
 VIEW_M = 3.0
 """What was seen over so much of the way is searched for at once."""
-TARGETS = 15
-REGIONS = 2
+AROUND_M = 5.0
+PLACE_M = 0.7
+MOST_TARGETS = 80
+TIED_TO = 12
 DRIFT_M, DRIFT_M_PER_M = 0.4, 0.05
 DRIFT_RAD, DRIFT_RAD_PER_M = np.radians(6.0), np.radians(0.7)
 MOST_DRIFT_RAD = np.radians(45.0)
@@ -36,15 +38,15 @@ QUERY_SPACING_M = 0.10
 LEAST_SCORE = 0.45
 MOST_RIVAL = 0.88
 RIVAL_BEYOND_M = 0.5
-LEAST_MATCHED_SHARE = 0.55
+LEAST_MATCHED_SHARE = 0.6
 MOST_SEEN_THROUGH = 0.2
 LEAST_MATCHED = 20
 GATES_M = (0.3, 0.15)
 LOOSE = np.diag([1.0, 1.0, 10.0])
 MOST_COST = 16.0
 """Greatest squared error of a loop's links once the graph has followed [sigma^2]."""
-MOST_STRAIN = 25.0
-"""Greatest rise of the squared error of the worst older link [sigma^2]."""
+MOST_STRAIN = 300.0
+"""Greatest rise of the squared errors of all older links together [sigma^2]."""
 
 
 @dataclass(frozen=True)
@@ -82,53 +84,54 @@ def close_loops(
     most_drift_m : float
         Half width of the greatest window [m].
     """
-    outcome = LoopSearch()
-    for region in _regions(graph, scan, distance, most_drift_m):
-        links = _recognised(graph, scan, region, distance, most_drift_m)
-        closed = links is not None and _tied(graph, links)
-        outcome += LoopSearch(1, int(links is not None), int(closed))
-        if closed:
-            break
-    return outcome
+    region, way = _region(graph, scan, distance, most_drift_m)
+    if len(region) == 0:
+        return LoopSearch()
+    links = _recognised(graph, scan, region, way, most_drift_m)
+    closed = links is not None and _tied(graph, links)
+    return LoopSearch(1, int(links is not None), int(closed))
 
 
 def _window(distance: FloatArray, most_drift_m: float) -> FloatArray:
     return np.minimum(DRIFT_M + DRIFT_M_PER_M * distance, most_drift_m)
 
 
-def _regions(
+def _region(
     graph: GrowingGraph, scan: int, distance: FloatArray, most_drift_m: float
-) -> list[NDArray[np.int64]]:
-    """Groups of old scans near a scan, each known well within itself, nearest first."""
+) -> tuple[NDArray[np.int64], float]:
+    """Old scans wherever the scan may stand, spread evenly, and the way to the farthest [m].
+
+    All of the window has to be shown: where the true place is missing, a false one has no rival.
+    """
     pose = graph.pose
     gap = np.hypot(*(pose[:, :2] - pose[scan, :2]).T)
+    old = distance > GAP_M
     distance = np.minimum(distance, 1e6)
-    excess = gap - _window(distance, most_drift_m)
-    left = (distance > GAP_M) & (excess < NEAR_M)
-    regions: list[NDArray[np.int64]] = []
-    while left.any() and len(regions) < REGIONS:
-        candidates = np.flatnonzero(left)
-        nearest = candidates[np.argmin(gap[candidates])]
-        around = np.hypot(*(pose[:, :2] - pose[nearest, :2]).T)
-        together = np.abs(distance - distance[nearest]) < GAP_M
-        members = np.flatnonzero((around < 4.0) & together & (distance > 0.5 * GAP_M))
-        order = np.argsort(gap[members], kind="stable")
-        regions.append(members[order][:TARGETS])
-        left &= around > 4.0
-    return regions
+    candidates = old & (gap < NEAR_M + _window(distance, most_drift_m))
+    if not candidates.any():
+        return np.empty(0, dtype=np.int64), 0.0
+    way = float(np.max(distance[candidates]))
+    reach = AROUND_M + float(_window(np.array(way), most_drift_m))
+    members = np.flatnonzero(old & (gap < reach))
+    # One scan a place and direction shows all that there is to see.
+    place = np.floor(pose[members, :2] / PLACE_M).astype(np.int64)
+    sector = np.floor(pose[members, 2] / (np.pi / 2)).astype(np.int64)
+    key = (place[:, 0] * 100_003 + place[:, 1]) * 8 + sector
+    _, first = np.unique(key, return_index=True)
+    chosen = members[np.sort(first)]
+    return chosen[np.argsort(gap[chosen], kind="stable")][:MOST_TARGETS], way
 
 
 def _recognised(
     graph: GrowingGraph,
     scan: int,
     region: NDArray[np.int64],
-    distance: FloatArray,
+    way: float,
     most_drift_m: float,
 ) -> Links | None:
     """Links to the scans of a region if the scan's surroundings are found there."""
     view = recent_view(graph, scan)
     expected = graph.pose[scan]
-    way = float(np.min(distance[region]))
     grid = nearness_grid(graph.points_of(region), expected[:2])
     found = best_placement(
         grid,
@@ -141,28 +144,40 @@ def _recognised(
     )
     if found is None or found.rival > MOST_RIVAL * found.score:
         return None
-    scans = [*(graph.scans[k] for k in region), view]
-    store = PointStore.of(scans)
-    pose = np.vstack([graph.pose[region], found.pose])
-    moving = len(region)
+    near = _overlapping(graph, region, view, found.pose)
+    old = [graph.scans[k] for k in near]
+    store = PointStore.of([*old, view])
+    moving = len(near)
     aligned = aligned_scan(
-        store, pose, moving=moving, prior=found.pose, prior_information=LOOSE, gates_m=GATES_M
+        store,
+        np.vstack([graph.pose[near], found.pose]),
+        moving=moving,
+        prior=found.pose,
+        prior_information=LOOSE,
+        gates_m=GATES_M,
     )
-    pose[-1] = aligned.pose
-    if aligned.matched < LEAST_MATCHED_SHARE:
-        return None
-    through = seen_through_share(
-        [graph.scans[k] for k in region], pose[:-1], graph.scans[scan], pose[-1]
-    )
-    if through > MOST_SEEN_THROUGH:
+    pose = np.vstack([graph.pose[near], aligned.pose])
+    through = seen_through_share(old, pose[:-1], view, graph.scans[scan], pose[-1])
+    if aligned.matched < LEAST_MATCHED_SHARE or through > MOST_SEEN_THROUGH:
         return None
     pairs = np.stack([np.full(moving, moving), np.arange(moving)], axis=-1)
     fits = pair_fits(store, pose, pairs, gate_m=GATES_M[-1])
     links = scan_links(pose, pairs, fits, least_matched=LEAST_MATCHED)
     if len(links) == 0:
         return None
-    index = np.append(region, scan)
+    index = np.append(near, scan)
     return Links(index[links.pairs], links.measured, links.information)
+
+
+def _overlapping(
+    graph: GrowingGraph, region: NDArray[np.int64], view: KeyScan, place: FloatArray
+) -> NDArray[np.int64]:
+    """The scans of a region that show most of a view from a place."""
+    store = PointStore.of([*(graph.scans[k] for k in region), view])
+    pose = np.vstack([graph.pose[region], place])
+    pairs = np.stack([np.full(len(region), len(region)), np.arange(len(region))], axis=-1)
+    matched = pair_fits(store, pose, pairs, gate_m=GATES_M[0], stride=2).matched
+    return region[np.argsort(-matched, kind="stable")][:TIED_TO]
 
 
 def _tied(graph: GrowingGraph, links: Links) -> bool:
@@ -172,10 +187,11 @@ def _tied(graph: GrowingGraph, links: Links) -> bool:
     if np.all(link_costs(graph.pose, links) < MOST_COST / 4.0):
         graph.add_links(links)
         return True
-    cost_before = link_costs(graph.pose, before)
-    solution = solved_graph(graph.pose, together)
+    settled = solved_graph(graph.pose, before)
+    solution = solved_graph(settled.pose, together)
+    cost_before = link_costs(settled.pose, before)
     cost = link_costs(solution.pose, together)
-    strain = float(np.max(cost[: len(before)] - cost_before))
+    strain = float(np.sum(cost[: len(before)]) - np.sum(cost_before))
     if np.median(cost[len(before) :]) > MOST_COST or strain > MOST_STRAIN:
         return False
     graph.add_links(links)
@@ -228,21 +244,28 @@ THROUGH_M = 0.4
 
 
 def seen_through_share(
-    old: list[KeyScan], old_pose: FloatArray, new: KeyScan, new_pose: FloatArray
+    old: list[KeyScan],
+    old_pose: FloatArray,
+    view: KeyScan,
+    new: KeyScan,
+    new_pose: FloatArray,
 ) -> float:
-    """Share of the surfaces in mutual view that one scan shows and the other looks through.
+    """Share of the surfaces in mutual view that one side shows and the other looks through.
 
     Parameters
     ----------
     old : list of KeyScan
     old_pose : ndarray, shape (K, 3)
+    view : KeyScan
+        What was seen lately, to be looked at from the old poses.
     new : KeyScan
+        What is seen from the new pose, to look from.
     new_pose : ndarray, shape (3,)
     """
     counts = np.zeros(2, dtype=np.int64)
     for scan, pose in zip(old, old_pose, strict=True):
         counts += _judged(new, relative(new_pose, pose), scan)
-        counts += _judged(scan, relative(pose, new_pose), new)
+        counts += _judged(scan, relative(pose, new_pose), view)
     return float(counts[1] / max(counts.sum(), 1))
 
 

@@ -19,7 +19,7 @@ ERRORS = {
 @pytest.fixture(scope="module")
 def drive():
     truth = worlds.driven(drives.ROUND)
-    scans = worlds.laser_scans(truth, [worlds.FRONT, worlds.BACK], rate_hz=10, beams=361)
+    scans = worlds.laser_scans(truth, [worlds.FRONT, worlds.BACK], rate_hz=6, beams=271)
     return truth, drives.noisy(scans, 0.015)
 
 
