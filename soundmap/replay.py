@@ -17,12 +17,13 @@ from soundmap.detect.source_list import detect_sources
 from soundmap.errors import ConfigError, NothingUsableError, OutputError
 from soundmap.fuse.accumulate import PowerAccumulator
 from soundmap.fuse.power_map import fused_scans, level_reference, power_map_frame
+from soundmap.geometry import Mount
 from soundmap.grid import OccupancyGrid
 from soundmap.localize.trajectory import estimate_trajectory
 from soundmap.logs.robot_log import RobotLog, open_log
 from soundmap.map_file import read_map
 from soundmap.outputs.progress import Progress, Stage
-from soundmap.outputs.run_folder import read_power_map
+from soundmap.outputs.stored_run import read_power_map
 from soundmap.run import Run
 from soundmap.scan.audio_scan import audio_scans
 from soundmap.scan.spectrum import band_bins
@@ -100,7 +101,7 @@ def process(
         config=config,
         room=room,
         trajectory=trajectory,
-        scans=keeper.audio_scans(reference),
+        scans=keeper.audio_scans(reference, array.mount),
         power_map=power_map,
         sources=sources,
         losses=tuple(log.losses),
@@ -190,9 +191,9 @@ class _Keeper:
             self._bearing_rad = scan.bearing_rad
             yield scan
 
-    def audio_scans(self, reference: LevelReference) -> AudioScans:
+    def audio_scans(self, reference: LevelReference, mount: Mount) -> AudioScans:
         time_ns = np.array(self._time_ns, dtype=np.int64)
-        return AudioScans(time_ns, self._bearing_rad, np.array(self._power), reference)
+        return AudioScans(time_ns, self._bearing_rad, np.array(self._power), reference, mount)
 
 
 class _Stopwatch:

@@ -9,7 +9,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from soundmap.geometry import FloatArray
+from soundmap.geometry import FloatArray, Mount
 from soundmap.grid import GridFrame
 
 REFERENCE_PRESSURE_PA = 20e-6
@@ -93,12 +93,15 @@ class AudioScans:
     power : ndarray of float32, shape (S, N)
         [linear].
     reference : LevelReference
+    mount : Mount or None
+        Where the array sits on the robot, and its bearings with it; None if nobody knows.
     """
 
     time_ns: NDArray[np.int64]
     bearing_rad: FloatArray
     power: NDArray[np.float32]
     reference: LevelReference
+    mount: Mount | None = None
 
     def __post_init__(self) -> None:
         if self.power.shape != (len(self.time_ns), len(self.bearing_rad)):

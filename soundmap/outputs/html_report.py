@@ -61,7 +61,7 @@ dt { color: #555; } dd { margin: 0; overflow-wrap: anywhere; }
 @media print {
   body { font-size: 10.5pt; max-width: none; padding: 0; }
   figure, tr, li { break-inside: avoid; } h2 { break-after: avoid; }
-  figure img { max-height: 21cm; width: auto; }
+  figure img { max-height: 16cm; width: auto; }
   .wide { overflow: visible; }
   details::details-content { content-visibility: visible; display: block; block-size: auto; }
 }

@@ -24,7 +24,7 @@ from soundmap.sound import Change, PowerRatio, SourceList, decibels
 SCHEMA_VERSION = 1
 SOURCE_COLUMNS = ("id", "x_m", "y_m", "power_db", "visits", "power_reference")
 CHANGE_COLUMNS = ("id", "x_m", "y_m", "ratio_db", "visits")
-LIBRARIES = ("numpy", "scipy", "numba", "matplotlib", "mcap", "rosbags", "pydantic")
+LIBRARIES = ("numpy", "scipy", "numba", "matplotlib", "mcap", "rosbags", "pydantic", "rerun-sdk")
 
 
 def run_report(run: Run, timings_s: Mapping[str, float]) -> dict[str, Any]:
@@ -40,6 +40,7 @@ def run_report(run: Run, timings_s: Mapping[str, float]) -> dict[str, Any]:
     return {
         **provenance(),
         "log": run.log.name,
+        "log_path": str(run.log.absolute()),
         "fingerprint": run.fingerprint,
         "duration_s": run.duration_s,
         "speed": run.duration_s / spent if spent > 0 else None,

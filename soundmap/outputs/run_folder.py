@@ -1,21 +1,18 @@
-"""The folder of a run, and that of a difference of two runs: writing both, reading power maps."""
+"""The folder of a run, and that of a difference of two runs, as they are written."""
 
 from __future__ import annotations
 
 import json
 import time
-import zipfile
-import zlib
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from soundmap.config import DiffConfig, config_toml
-from soundmap.errors import LogError
 from soundmap.geometry import FloatArray, Trajectory
 from soundmap.grid import GridFrame, OccupancyGrid
 from soundmap.map_file import map_files
@@ -33,9 +30,7 @@ from soundmap.outputs.report import (
     run_report,
 )
 from soundmap.run import Run
-from soundmap.sound import AudioScans, LevelReference, PowerMap, PowerRatio
-
-POWER_MAP = "power_map.npz"
+from soundmap.sound import AudioScans, PowerMap, PowerRatio
 
 
 def write_run(
@@ -59,7 +54,10 @@ def write_run(
     share = run.config.detect.min_visit_share
     with writing(folder):
         (folder / "trajectory.tum").write_text(tum_text(run.trajectory), encoding="ascii")
-        write_arrays(folder / POWER_MAP, power_map_arrays(run.power_map, min_visit_share=share))
+        write_arrays(folder / "trajectory.npz", _trajectory_arrays(run.trajectory))
+        write_arrays(
+            folder / "power_map.npz", power_map_arrays(run.power_map, min_visit_share=share)
+        )
         write_arrays(folder / "audio_scans.npz", _audio_scan_arrays(run.scans))
         _write_map(folder, run.room)
         (folder / "config.toml").write_text(config_toml(run.config), encoding="utf-8")
@@ -157,65 +155,37 @@ def power_map_arrays(power_map: PowerMap, *, min_visit_share: float) -> dict[str
     }
 
 
-def read_power_map(folder: Path) -> tuple[PowerMap, float]:
-    """Power map of a run folder, and the share of the greatest visits that a cell has to exceed.
-
-    Raises
-    ------
-    LogError
-        Not a run folder, a damaged one, or one of a newer soundmap.
-    """
-    file = folder / POWER_MAP
-    if not file.is_file():
-        raise LogError(
-            f"{folder}: no run folder: it holds no {POWER_MAP}. Give the folder that "
-            "`soundmap process` wrote."
-        )
-    damaged = f"{file}: cannot be read as a power map"
-    try:
-        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-            version = int(stored["schema_version"])
-            if version > SCHEMA_VERSION:
-                raise LogError(
-                    f"{file}: written by a newer soundmap (schema {version}; this one reads up to "
-                    f"{SCHEMA_VERSION}). Update soundmap, or process the log again."
-                )
-            return _stored_power_map(stored), float(stored["min_visit_share"])
-    except KeyError as error:
-        raise LogError(f"{damaged}: {error.args[0]}. Process the log again.") from None
-    except (OSError, ValueError, TypeError, EOFError, MemoryError) as error:
-        raise LogError(f"{damaged}: {error}. Process the log again.") from None
-    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError) as error:
-        raise LogError(f"{damaged}: damaged file ({error}). Process the log again.") from None
-
-
 def write_arrays(file: Path, arrays: Mapping[str, ArrayLike]) -> None:
     """Write an NPZ archive; equal arrays give equal bytes, whenever they are written."""
     content: dict[str, Any] = {name: np.asarray(array) for name, array in arrays.items()}
     np.savez_compressed(file, **content)
 
 
-def _stored_power_map(stored: Mapping[str, NDArray[Any]]) -> PowerMap:
-    visits, power_sum = stored["visits"], stored["power_sum"]
-    if visits.ndim != 2 or not np.issubdtype(visits.dtype, np.integer):
-        raise ValueError("visits should be whole numbers in two dimensions")
-    if np.any(visits < 0) or not np.all(np.isfinite(power_sum)):
-        raise ValueError("sums should be finite and visits not negative")
-    x, y = (float(value) for value in stored["origin_m"])
-    resolution = float(stored["resolution_m"])
-    if not np.all(np.isfinite([x, y, resolution])):
-        raise ValueError("the grid has no finite place")
-    frame = GridFrame(resolution, (x, y), (visits.shape[0], visits.shape[1]))
-    reference = LevelReference(str(stored["reference"]))
-    return PowerMap(frame, power_sum.astype(np.float64), visits.astype(np.int64), reference)
-
-
 def _audio_scan_arrays(scans: AudioScans) -> dict[str, ArrayLike]:
+    mount: dict[str, ArrayLike] = {}
+    if scans.mount is not None:
+        mount["array_rotation"] = scans.mount.rotation
+        mount["array_translation_m"] = scans.mount.translation_m
     return {
         "time_ns": scans.time_ns,
         "bearing_rad": scans.bearing_rad,
         "power": scans.power.astype(np.float32, copy=False),
         "reference": str(scans.reference),
+        **mount,
+        "schema_version": SCHEMA_VERSION,
+    }
+
+
+def _trajectory_arrays(trajectory: Trajectory) -> dict[str, ArrayLike]:
+    """What the TUM format cannot say, too: which poses may be trusted, and how far."""
+    known: dict[str, ArrayLike] = {}
+    if trajectory.covariance is not None:
+        known["covariance"] = trajectory.covariance
+    return {
+        "time_ns": trajectory.time_ns,
+        "pose": trajectory.pose,
+        "usable": trajectory.usable,
+        **known,
         "schema_version": SCHEMA_VERSION,
     }
 

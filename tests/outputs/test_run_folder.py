@@ -12,7 +12,8 @@ from soundmap.config import Config, DiffConfig, loaded_config
 from soundmap.errors import LogError, OutputError
 from soundmap.geometry import Trajectory
 from soundmap.map_file import read_map
-from soundmap.outputs.run_folder import read_power_map, tum_text, write_diff, write_run
+from soundmap.outputs.run_folder import tum_text, write_diff, write_run
+from soundmap.outputs.stored_run import read_power_map
 
 CONTENT = {
     "audio_scans.npz",
@@ -25,6 +26,7 @@ CONTENT = {
     "report.html",
     "report.json",
     "sources.csv",
+    "trajectory.npz",
     "trajectory.png",
     "trajectory.tum",
 }

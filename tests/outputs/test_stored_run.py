@@ -1,0 +1,108 @@
+import json
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from handmade import made_ratio, made_run, unlucky_run, walled_room
+
+from soundmap.config import DiffConfig
+from soundmap.errors import LogError
+from soundmap.geometry import Mount
+from soundmap.outputs.picture_format import PictureFormat
+from soundmap.outputs.run_folder import write_diff, write_run
+from soundmap.outputs.stored_run import read_difference, read_report, read_run
+from soundmap.run import Run
+
+
+def written(run: Run, folder: Path) -> Path:
+    write_run(run, folder, figures=PictureFormat.NONE)
+    return folder
+
+
+def same(first: object, second: object) -> bool:
+    """Equality of dataclasses that hold arrays."""
+    if isinstance(first, np.ndarray):
+        return np.array_equal(first, second)
+    if hasattr(first, "__dataclass_fields__"):
+        return all(same(getattr(first, f.name), getattr(second, f.name)) for f in fields(first))
+    return first == second
+
+
+def test_a_run_reads_back_as_it_was(tmp_path):
+    run = made_run()
+    mount = Mount.from_quaternion([0.1, -0.2, 0.6], [0.1, 0.2, 0.3, 0.9])
+    covariance = np.random.default_rng(1).normal(size=(len(run.trajectory), 3, 3))
+    run = replace(
+        run,
+        scans=replace(run.scans, mount=mount),
+        trajectory=replace(run.trajectory, covariance=covariance),
+    )
+    read = read_run(written(run, tmp_path))
+    for name in ("trajectory", "scans", "power_map", "room", "losses", "config", "counts"):
+        assert same(getattr(read, name), getattr(run, name)), name
+    assert read.log == Path.cwd() / "logs" / "run1.mcap"
+    assert read.fingerprint == "0123abcd"
+    assert [source.visits for source in read.sources] == [22, 17]
+    assert [source.power for source in read.sources] == pytest.approx([4e-7, 1e-7], rel=2e-4)
+
+
+def test_a_run_that_heard_nothing_reads_back_too(tmp_path):
+    read = read_run(written(unlucky_run(), tmp_path))
+    assert len(read.sources) == 0
+    assert len(read.scans) == 0
+    assert read.scans.mount is None
+
+
+def test_a_difference_reads_back_as_it_was(tmp_path):
+    ratio = made_ratio()
+    write_diff(
+        ratio,
+        tmp_path,
+        room=walled_room(),
+        run=Path("run1"),
+        background=Path("run3"),
+        config=DiffConfig(),
+        timings_s={},
+        figures=PictureFormat.NONE,
+    )
+    read = read_difference(tmp_path)
+    np.testing.assert_array_equal(read.ratio.ratio_db, ratio.ratio_db)
+    np.testing.assert_array_equal(read.ratio.background_measured, ratio.background_measured)
+    assert read.ratio.frame == ratio.frame
+    assert [change.ratio_db for change in read.ratio.changes] == [26.02, 19.9]
+    assert same(read.room, walled_room())
+    assert read.title == "run1 against run3"
+
+
+def test_what_is_no_run_folder_is_said_to_be_none(tmp_path):
+    with pytest.raises(LogError, match=r"no run folder: it holds no power_map\.npz"):
+        read_run(tmp_path)
+    with pytest.raises(LogError, match=r"no run folder: it holds no report\.json"):
+        read_difference(tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"{", b"[1]", b"\xff\xfe"])
+def test_a_damaged_report_is_named(tmp_path, content):
+    (tmp_path / "report.json").write_bytes(content)
+    with pytest.raises(LogError, match=r"report\.json: cannot be read"):
+        read_report(tmp_path)
+
+
+@pytest.mark.parametrize("missing", ["log_path", "sources", "level_reference", "losses"])
+def test_a_report_that_lacks_something_is_named(tmp_path, missing):
+    folder = written(made_run(), tmp_path)
+    report = json.loads((folder / "report.json").read_text())
+    del report[missing]
+    (folder / "report.json").write_text(json.dumps(report))
+    with pytest.raises(LogError, match=rf"report\.json: cannot be read.*{missing}"):
+        read_run(folder)
+
+
+@pytest.mark.parametrize("name", ["trajectory.npz", "audio_scans.npz"])
+def test_a_damaged_archive_is_named(tmp_path, name):
+    folder = written(made_run(), tmp_path)
+    content = (folder / name).read_bytes()
+    (folder / name).write_bytes(content[: len(content) // 2])
+    with pytest.raises(LogError, match=f"{name}: cannot be read as part of a run"):
+        read_run(folder)
