@@ -36,6 +36,7 @@ Examples:
   soundmap process run1.mcap --map map.yaml
   soundmap process run1.mcap run3.mcap --map map.yaml --config robot.toml
   soundmap diff run1 run3
+  soundmap view run1
 
 \b
 Exit codes: 0 done, 1 failed, 2 wrong usage or configuration, 3 unreadable
@@ -137,6 +138,12 @@ def process(
     ] = None,
     figures: FiguresOption = PictureFormat.PNG,
     *,
+    rerun: Annotated[
+        bool,
+        typer.Option(
+            "--rerun", help="Write a recording for the Rerun viewer, too; see soundmap view."
+        ),
+    ] = False,
     force: ForceOption = False,
     strict: Annotated[
         bool,
@@ -171,6 +178,7 @@ def process(
                 settings,
                 start=start,
                 figures=figures,
+                rerun=rerun,
                 force=force,
                 quiet=quiet or as_json,
             )
@@ -187,6 +195,7 @@ def process(
 app.command("map")(cli_map.map_log)
 app.command()(cli_runs.diff)
 app.command()(cli_runs.evaluate)
+app.command()(cli_runs.view)
 
 
 @app.command()
@@ -247,6 +256,7 @@ def _processed(
     *,
     start: tuple[float, float, float] | None,
     figures: PictureFormat,
+    rerun: bool,
     force: bool,
     quiet: bool,
 ) -> dict[str, Any]:
@@ -258,9 +268,12 @@ def _processed(
     with new_folder(folder, force=force, inputs=[log]) as new:
         from soundmap.replay import process as processed
 
-        run = processed(
-            log, map_file, config, start_pose=start, progress=chosen_progress(quiet=quiet)
-        )
+        progress = chosen_progress(quiet=quiet)
+        run = processed(log, map_file, config, start_pose=start, progress=progress)
+        if rerun:
+            from soundmap.retelling import recorded
+
+            run = recorded(run, new, progress=progress)
         return write_run(run, new, figures=figures)
 
 

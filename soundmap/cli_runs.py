@@ -1,7 +1,8 @@
-"""Commands on finished run folders: compare, judge."""
+"""Commands on finished run folders: compare, judge, look."""
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated
@@ -88,6 +89,14 @@ def evaluate(
             help="Where the robot truly was, in the frame of the same map, in TUM format.",
         ),
     ] = None,
+    figure: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Picture to write, as .png, .pdf or .svg: the power map with the truth as "
+            "crosses.",
+        ),
+    ] = None,
     *,
     as_json: JsonOption = False,
 ) -> None:
@@ -95,7 +104,42 @@ def evaluate(
 
     A source counts as detected when something was found within 0.5 m of it.
     """
-    from soundmap.evaluate import evaluation, evaluation_view
+    from soundmap.evaluate import evaluation, evaluation_view, read_places
 
     result = evaluation(run, sources, trajectory)
+    if figure is not None:
+        from soundmap.outputs.pictures import write_truth_picture
+        from soundmap.outputs.stored_run import read_run
+
+        places = [(place.x_m, place.y_m) for place in read_places(sources)]
+        write_truth_picture(read_run(run), places, figure)
     print_result(result.as_dict(), lambda _: evaluation_view(result), as_json=as_json)
+
+
+def view(
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="Folder that process or diff has written.")
+    ],
+    *,
+    save: Annotated[
+        bool, typer.Option("--save", help="Write the recording, but do not open the viewer.")
+    ] = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Watch a run, or a difference of two, in the Rerun viewer.
+
+    Makes the recording if it is missing: run.rrd, or diff.rrd, in the folder.
+    """
+    from soundmap.outputs.progress import chosen_progress
+    from soundmap.outputs.viewer import elsewhere, has_display, show
+    from soundmap.retelling import recording_of
+
+    file, remark = recording_of(folder, progress=chosen_progress(quiet=quiet))
+    if remark and not quiet:
+        print(f"soundmap: note: {remark}", file=sys.stderr)
+    if save or not has_display():
+        if not quiet:
+            reason = "" if save else "there is no display here; "
+            print(f"{file}\n{reason}{elsewhere(file)}")
+        return
+    show(file)

@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 
 import soundmap.logs.summary
 import soundmap.outputs.pictures
+import soundmap.outputs.viewer
 import soundmap.replay
 from soundmap import __version__
 from soundmap.cli import app
@@ -299,6 +300,56 @@ def test_a_difference_with_no_run_folder_is_unreadable_input(tmp_path, monkeypat
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.fixture
+def watched(processed, monkeypatch) -> list[Path]:
+    """A folder of a run, without its log; the files that the viewer is opened with."""
+    opened: list[Path] = []
+    assert invoked("process", "a.mcap", "--map", "m.yaml", "--figures", "none").exit_code == 0
+    monkeypatch.setattr(soundmap.outputs.viewer, "show", opened.append)
+    monkeypatch.setattr(soundmap.outputs.viewer, "has_display", lambda: True)
+    return opened
+
+
+def test_a_finished_run_is_watched_and_what_its_recording_lacks_is_told(watched):
+    result = invoked("view", "a")
+    assert result.exit_code == 0, result.output
+    assert watched == [Path("a/run.rrd")]
+    assert "a.mcap: the log is no longer there" in result.stderr
+    assert result.stdout == ""
+
+
+def test_a_recording_is_only_written_with_save(watched):
+    result = invoked("view", "a", "--save")
+    assert watched == []
+    assert Path("a/run.rrd").is_file()
+    assert result.stdout.startswith("a/run.rrd\n")
+    assert "scp " in result.stdout
+
+
+def test_without_a_display_the_way_to_look_elsewhere_is_told(watched, monkeypatch):
+    monkeypatch.setattr(soundmap.outputs.viewer, "has_display", lambda: False)
+    result = invoked("view", "a")
+    assert result.exit_code == 0
+    assert watched == []
+    assert "there is no display here" in result.stdout
+    assert "rerun run.rrd" in result.stdout
+
+
+def test_what_is_no_run_folder_cannot_be_watched(tmp_path):
+    result = invoked("view", tmp_path)
+    assert result.exit_code == 3
+    assert "no run folder" in result.stderr
+
+
+def test_a_recording_is_made_with_the_run_when_asked_for(processed):
+    assert invoked("process", "a.mcap", "--map", "m.yaml").exit_code == 0
+    assert not Path("a/run.rrd").exists()
+    result = invoked("process", "b.mcap", "--map", "m.yaml", "--rerun", "--json")
+    assert result.exit_code == 0
+    assert Path("b/run.rrd").is_file()
+    assert json.loads(result.stdout)["timings_s"]["record"] > 0
+
+
 def test_info_prints_json_or_text(monkeypatch):
     content = {
         "path": "run1.mcap",
@@ -324,7 +375,7 @@ def test_the_version_is_told():
     assert invoked("--version").stdout == f"soundmap {__version__}\n"
 
 
-@pytest.mark.parametrize("command", ["process", "info", "diff"])
+@pytest.mark.parametrize("command", ["process", "info", "diff", "evaluate", "view"])
 def test_every_option_is_explained(command):
     text = invoked(command, "--help").stdout
     options = re.findall(r"^  (?:-\w, )?(--[\w-]+)(.*)$", text, flags=re.MULTILINE)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from soundmap.errors import OutputError
 from soundmap.grid import OccupancyGrid
 from soundmap.outputs.picture_format import PictureFormat
 from soundmap.run import Run
@@ -66,6 +67,27 @@ def write_pictures(
         is_for_print = form == PictureFormat.PDF
         shown[name] = picture_bytes(figure, PictureFormat.PNG) if is_for_print else content
     return shown
+
+
+def write_truth_picture(run: Run, truth: Sequence[tuple[float, float]], file: Path) -> None:
+    """Fig. 6b: the power map with crosses where the sources truly are, x and y [m].
+
+    Raises
+    ------
+    OutputError
+        The name of the file does not end in a format of pictures, or it cannot be written.
+    """
+    from soundmap.outputs import figures
+
+    ending = file.suffix.lower().removeprefix(".")
+    forms = [str(form) for form in PictureFormat if form != PictureFormat.NONE]
+    if ending not in forms:
+        raise OutputError(f"{file}: a picture ends in .{', .'.join(forms)}.")
+    content = picture_bytes(figures.power_map_figure(run, truth=truth), PictureFormat(ending))
+    try:
+        file.write_bytes(content)
+    except OSError as error:
+        raise OutputError(f"{file}: cannot be written ({error.strerror}).") from None
 
 
 def picture_bytes(figure: Figure, form: PictureFormat) -> bytes:

@@ -1,0 +1,437 @@
+"""A run as a Rerun recording: the way it unfolded in time, and what came of it.
+
+The only import of Rerun. What came of the run is static, so it is seen whatever the time cursor;
+what happened lies on the log's own time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+import rerun as rr
+from matplotlib import colormaps
+from numpy.typing import ArrayLike, NDArray
+
+from soundmap.geometry import FloatArray
+from soundmap.grid import GridFrame, OccupancyGrid
+from soundmap.outputs.figures import not_below, shown_range
+from soundmap.outputs.floor import Area, area_of_interest, cropped
+from soundmap.outputs.recording_layout import difference_layout, run_layout
+from soundmap.outputs.stored_run import StoredDifference
+from soundmap.run import Run
+from soundmap.sound import PowerMap, decibels
+
+APPLICATION = "soundmap"
+TIMELINE = "time"
+FLOOR_Z, POWER_Z, LINE_Z = 0.0, 0.01, 0.03
+"""Heights at which flat things are drawn, one above the other [m]."""
+WALL_RGBA, OPEN_RGBA, UNKNOWN_RGBA = (90, 95, 105, 255), (236, 238, 240, 255), (34, 38, 46, 255)
+BLUE, VERMILION, GREEN = (0, 114, 178), (213, 94, 0), (0, 158, 115)
+PURPLE, DARK, WHITE = (117, 70, 160), (40, 44, 52), (255, 255, 255)
+SCANNER_COLOURS = MappingProxyType({0: (86, 180, 233), 1: (230, 159, 0), 2: (204, 121, 167)})
+LEAST_LOBE_M, GREATEST_LOBE_M = 0.25, 1.0
+"""Radius at which the polar curve of an audio scan shows the quietest and the loudest level."""
+ROBOT_M, RING_M = 0.2, 0.18
+"""Radius of the robot, and of the ring round a source [m]."""
+TRAJECTORY_STEPS, TRAJECTORY_POINTS = 200, 400
+ROWS_A_BATCH = 256
+ELLIPSE_SIGMAS = 2.0
+
+
+@contextmanager
+def recording(file: Path, blueprint: rr.blueprint.Blueprint) -> Iterator[rr.RecordingStream]:
+    """A stream that writes a complete file, whatever happens in between."""
+    stream = rr.RecordingStream(APPLICATION)
+    stream.save(file, default_blueprint=blueprint)
+    try:
+        stream.log("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        yield stream
+    finally:
+        stream.flush()
+        stream.disconnect()
+
+
+class RunRecording:
+    """What a run yields, drawn into a stream; what the log tells is added as it comes.
+
+    Parameters
+    ----------
+    stream : rerun.RecordingStream
+    run : Run
+    """
+
+    def __init__(self, stream: rr.RecordingStream, run: Run) -> None:
+        self._stream, self._run = stream, run
+        self._lasers: dict[int, list[tuple[int, FloatArray]]] = {}
+        self._hits: list[tuple[int, FloatArray, FloatArray]] = []
+        self._matches: list[tuple[int, float]] = []
+        share = run.config.detect.min_visit_share
+        self._level = decibels(run.power_map.power(min_visit_share=share))
+        self._low, self._high = shown_range(self._level)
+        measured = run.power_map.frame.centres(np.argwhere(run.power_map.visits > 0))
+        self._measured = _bounding_area(measured, run.power_map.frame)
+        _draw_floor(stream, run.room)
+        self._draw_results()
+        self._draw_trajectory()
+        self._draw_scans()
+        stream.log(
+            "/summary", rr.TextDocument(run_markdown(run), media_type="text/markdown"), static=True
+        )
+
+    def add_laser(self, time_ns: int, scanner: int, points_m: FloatArray, match: float) -> None:
+        """Points of a laser scan in the map frame, shape (P, 2), and the share on its walls."""
+        waiting = self._lasers.setdefault(scanner, [])
+        waiting.append((time_ns, points_m))
+        self._matches.append((time_ns, match))
+        if len(waiting) >= ROWS_A_BATCH:
+            self._send_lasers(scanner)
+
+    def add_hit(self, time_ns: int, array_m: FloatArray, point_m: FloatArray) -> None:
+        """The bearing chosen: from the array to the surface it meets, x, y in the map frame [m]."""
+        self._hits.append((time_ns, array_m, point_m))
+
+    def add_power_map(self, time_ns: int, power_map: PowerMap) -> None:
+        """The power map as it was at a time; every cell measured so far."""
+        level = decibels(power_map.power())
+        self._send_grid("/world/run/power", level, power_map.frame, time_ns)
+
+    @property
+    def power_map_bytes(self) -> int:
+        """Size of the power map at one time, before compression."""
+        part, _ = cropped(self._level, self._run.power_map.frame, self._measured)
+        return 4 * part.size
+
+    def finish(self) -> None:
+        """Send what is still waiting."""
+        for scanner in sorted(self._lasers):
+            self._send_lasers(scanner)
+        self._send_hits()
+        if self._matches:
+            time_ns, match = zip(*self._matches, strict=True)
+            self._send_series("/plots/pose/laser_points_on_walls", time_ns, match, BLUE)
+
+    def _draw_results(self) -> None:
+        run, stream = self._run, self._stream
+        self._send_grid("/world/result/power", self._level, run.power_map.frame, None)
+        levels = [float(decibels(source.power)) for source in run.sources]
+        _draw_places(
+            stream,
+            [(source.x_m, source.y_m) for source in run.sources],
+            [f"S{n}  {level:.1f} dB" for n, level in enumerate(levels, start=1)],
+        )
+
+    def _draw_trajectory(self) -> None:
+        trajectory, stream = self._run.trajectory, self._stream
+        if len(trajectory) == 0:
+            return
+        points = _raised(trajectory.pose[:, :2], LINE_Z)
+        for name, wanted, colour in (
+            ("trajectory", trajectory.usable, BLUE),
+            ("trajectory_not_to_be_trusted", ~trajectory.usable, VERMILION),
+        ):
+            strips = [points[piece] for piece in _stretches(wanted)]
+            if strips:
+                lines = rr.LineStrips3D(strips, colors=[colour], radii=rr.Radius.ui_points(1.5))
+                stream.log(f"/world/result/{name}", lines, static=True)
+        self._send_way_so_far(points)
+        time_ns = trajectory.time_ns
+        half = trajectory.pose[:, 2] / 2.0
+        zero = np.zeros_like(half)
+        turn = np.stack([zero, zero, np.sin(half), np.cos(half)], axis=-1)
+        at = _raised(trajectory.pose[:, :2], 0.0)
+        columns = rr.Transform3D.columns(translation=at, quaternion=turn)
+        self._send("/world/robot", time_ns, columns)
+        _draw_robot(stream)
+        trusted = trajectory.usable.astype(np.float64)
+        self._send_series("/plots/pose/trusted", time_ns, trusted, GREEN)
+        self._draw_uncertainty()
+
+    def _draw_uncertainty(self) -> None:
+        """The ellipse that holds the robot's place with two standard deviations."""
+        trajectory = self._run.trajectory
+        if trajectory.covariance is None:
+            return
+        values, axes = np.linalg.eigh(trajectory.covariance[:, :2, :2])
+        reach = ELLIPSE_SIGMAS * np.sqrt(np.maximum(values, 0.0))
+        ellipses = (_circle(1.0)[:, :2] * reach[:, None, :]) @ np.swapaxes(axes, 1, 2)
+        at = ellipses + trajectory.pose[:, None, :2]
+        self._send_curves(
+            "/world/run/pose_uncertainty", trajectory.time_ns, _raised(at, LINE_Z), GREEN
+        )
+        spread = np.sqrt(np.maximum(values.sum(axis=1), 0.0))
+        self._send_series("/plots/pose/spread_m", trajectory.time_ns, spread, VERMILION)
+
+    def _send_way_so_far(self, points: FloatArray) -> None:
+        """The way driven up to a time, at a limited number of times and points."""
+        count = len(points)
+        steps = np.unique(np.linspace(0, count - 1, min(count, TRAJECTORY_STEPS)).astype(int))
+        stride = max(1, count // TRAJECTORY_POINTS)
+        strips = [np.vstack([points[:step:stride], points[step]]) for step in steps if step > 0]
+        if not strips:
+            return
+        columns = rr.LineStrips3D.columns(strips=strips)
+        self._send("/world/run/trajectory", self._run.trajectory.time_ns[steps[steps > 0]], columns)
+        style = rr.LineStrips3D.from_fields(colors=[BLUE], radii=rr.Radius.ui_points(2.0))
+        self._stream.log("/world/run/trajectory", style, static=True)
+
+    def _draw_scans(self) -> None:
+        scans = self._run.scans
+        if len(scans) == 0:
+            return
+        level = decibels(scans.power.astype(np.float64))
+        loudest, mean = decibels(scans.power.max(axis=1)), decibels(scans.power.mean(axis=1))
+        for name, values, colour in (
+            ("loudest_bearing", loudest, VERMILION),
+            ("mean_of_all_bearings", mean, BLUE),
+        ):
+            time_ns, shown = _broken_at_gaps(scans.time_ns, np.asarray(values, dtype=np.float64))
+            self._send_series(f"/plots/level/{name}", time_ns, shown, colour)
+        if scans.mount is None:
+            return
+        low, high = shown_range(level)
+        share = (np.maximum(level, low) - low) / (high - low)
+        radius = LEAST_LOBE_M + (GREATEST_LOBE_M - LEAST_LOBE_M) * share
+        bearing = scans.mount.base_bearing(scans.bearing_rad)
+        towards = np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
+        curves = scans.mount.translation_m[:2] + radius[:, :, None] * towards
+        curves = np.concatenate([curves, curves[:, :1]], axis=1)
+        curves = _raised(curves, float(scans.mount.translation_m[2]))
+        self._send_curves("/world/robot/audio_scan", scans.time_ns, curves, PURPLE)
+
+    def _send_lasers(self, scanner: int) -> None:
+        waiting, self._lasers[scanner] = self._lasers[scanner], []
+        if not waiting:
+            return
+        time_ns = [time for time, _ in waiting]
+        counts = [len(points) for _, points in waiting]
+        points = _raised(np.concatenate([points for _, points in waiting]), 2.0 * LINE_Z)
+        columns = rr.Points3D.columns(positions=points).partition(counts)
+        name = f"/world/run/laser_{scanner + 1}"
+        self._send(name, time_ns, columns)
+        colour = SCANNER_COLOURS[scanner % len(SCANNER_COLOURS)]
+        style = rr.Points3D.from_fields(colors=[colour], radii=rr.Radius.ui_points(1.5))
+        self._stream.log(name, style, static=True)
+
+    def _send_hits(self) -> None:
+        if not self._hits:
+            return
+        time_ns = [time for time, _, _ in self._hits]
+        ends = _raised(np.array([pair[1:] for pair in self._hits]), 3.0 * LINE_Z)
+        self._send_curves("/world/run/chosen_bearing", time_ns, ends, DARK)
+        columns = rr.Points3D.columns(positions=ends[:, 1])
+        self._send("/world/run/laser_hit", time_ns, columns.partition([1] * len(ends)))
+        style = rr.Points3D.from_fields(colors=[VERMILION], radii=rr.Radius.ui_points(6.0))
+        self._stream.log("/world/run/laser_hit", style, static=True)
+
+    def _send_grid(
+        self, name: str, level: FloatArray, frame: GridFrame, time_ns: int | None
+    ) -> None:
+        part, (left, _, bottom, _) = cropped(level, frame, self._measured)
+        share = (not_below(part.astype(np.float64), self._low) - self._low) / (
+            self._high - self._low
+        )
+        rgba = _coloured(np.clip(share, 0.0, 1.0), "viridis")
+        grid = _grid(rgba, frame.resolution_m, (left, bottom), POWER_Z)
+        if time_ns is None:
+            self._stream.log(name, grid, static=True)
+        else:
+            self._stream.set_time(TIMELINE, timestamp=np.datetime64(time_ns, "ns"))
+            self._stream.log(name, grid)
+            self._stream.reset_time()
+
+    def _send_curves(
+        self, name: str, time_ns: ArrayLike, curves: FloatArray, colour: tuple[int, int, int]
+    ) -> None:
+        """One line a time, shape (times, points, 3)."""
+        self._send(name, time_ns, rr.LineStrips3D.columns(strips=list(curves)))
+        style = rr.LineStrips3D.from_fields(colors=[colour], radii=rr.Radius.ui_points(1.5))
+        self._stream.log(name, style, static=True)
+
+    def _send_series(
+        self, name: str, time_ns: ArrayLike, values: ArrayLike, colour: tuple[int, int, int]
+    ) -> None:
+        self._send(name, time_ns, rr.Scalars.columns(scalars=np.asarray(values, np.float64)))
+        style = rr.SeriesLines(
+            colors=[colour], names=[name.rsplit("/", 1)[1].replace("_", " ")], widths=[1.5]
+        )
+        self._stream.log(name, style, static=True)
+
+    def _send(self, name: str, time_ns: ArrayLike, columns: rr.ComponentColumnList) -> None:
+        times = np.asarray(time_ns, dtype=np.int64).astype("datetime64[ns]")
+        self._stream.send_columns(name, [rr.TimeColumn(TIMELINE, timestamp=times)], columns)
+
+
+@contextmanager
+def run_recording(run: Run, file: Path) -> Iterator[RunRecording]:
+    """A file with everything about a run; what the log tells is added in the ``with`` block."""
+    seen = [run.trajectory.pose[:, :2], _places([(s.x_m, s.y_m) for s in run.sources])]
+    with recording(file, run_layout(area_of_interest(seen, run.room))) as stream:
+        drawn = RunRecording(stream, run)
+        yield drawn
+        drawn.finish()
+
+
+def write_difference_recording(difference: StoredDifference, file: Path) -> None:
+    """A file with the difference of two runs on the map."""
+    ratio = difference.ratio
+    places = [(change.x_m, change.y_m) for change in ratio.changes]
+    measured = ratio.frame.centres(np.argwhere(~np.isnan(ratio.ratio_db)))
+    area = area_of_interest([measured, _places(places)], difference.room)
+    with recording(file, difference_layout(area)) as stream:
+        if difference.room is not None:
+            _draw_floor(stream, difference.room)
+        reach = float(np.clip(np.nanmax(np.abs(ratio.ratio_db), initial=0.0), 3.0, 20.0))
+        part, (left, _, bottom, _) = cropped(
+            ratio.ratio_db, ratio.frame, _bounding_area(measured, ratio.frame)
+        )
+        share = np.clip(part.astype(np.float64) / (2.0 * reach) + 0.5, 0.0, 1.0)
+        grid = _grid(_coloured(share, "RdBu_r"), ratio.frame.resolution_m, (left, bottom), POWER_Z)
+        stream.log("/world/result/power_ratio", grid, static=True)
+        labels = [f"S{n}  {change.ratio_db:+.1f} dB" for n, change in enumerate(ratio.changes, 1)]
+        _draw_places(stream, places, labels)
+        text = difference_markdown(difference)
+        stream.log("/summary", rr.TextDocument(text, media_type="text/markdown"), static=True)
+
+
+def run_markdown(run: Run) -> str:
+    """What was found, in a few lines and a table."""
+    unit = str(run.sources.reference).replace("^2", "²").replace("uPa", "µPa")
+    usable = f"{100 * run.trajectory.usable.mean():.1f} %" if len(run.trajectory) else "none"
+    lines = [f"# {run.log.name}", "", f"{run.duration_s:.1f} s; {usable} of the poses trusted.", ""]
+    if len(run.sources):
+        lines += [f"| | x [m] | y [m] | level [{unit}] | visits |", "|---|--:|--:|--:|--:|"]
+    else:
+        lines.append("No source was found.")
+    for number, source in enumerate(run.sources, start=1):
+        level = f"{float(decibels(source.power)):.1f}"
+        lines.append(
+            f"| S{number} | {source.x_m:.2f} | {source.y_m:.2f} | {level} | {source.visits} |"
+        )
+    lines += ["", "**Lost or noted**", ""]
+    lines += [f"- {loss.count} x {loss.what} ({loss.where}): {loss.effect}" for loss in run.losses]
+    return "\n".join(lines if run.losses else [*lines, "Nothing."])
+
+
+def difference_markdown(difference: StoredDifference) -> str:
+    """What changed, in a table."""
+    lines = [f"# {difference.title}", ""]
+    if difference.ratio.changes:
+        lines += ["| | x [m] | y [m] | louder by [dB] | visits |", "|---|--:|--:|--:|--:|"]
+    else:
+        lines.append("No place is louder than before.")
+    for number, change in enumerate(difference.ratio.changes, start=1):
+        place = f"{change.x_m:.2f} | {change.y_m:.2f}"
+        lines.append(f"| S{number} | {place} | {change.ratio_db:.1f} | {change.visits} |")
+    return "\n".join(lines)
+
+
+def _draw_floor(stream: rr.RecordingStream, room: OccupancyGrid) -> None:
+    rgba = np.empty((*room.frame.shape, 4), dtype=np.uint8)
+    rgba[:] = UNKNOWN_RGBA
+    rgba[room.free], rgba[room.occupied] = OPEN_RGBA, WALL_RGBA
+    grid = _grid(rgba, room.frame.resolution_m, room.frame.origin_m, FLOOR_Z)
+    stream.log("/world/map", grid, static=True)
+
+
+def _draw_robot(stream: rr.RecordingStream) -> None:
+    """A disc with a line to its front."""
+    height = np.array([0.0, 0.0, LINE_Z])
+    front = np.array([[0.0, 0.0, 0.0], [ROBOT_M, 0.0, 0.0]])
+    lines = [_circle(ROBOT_M) + height, front + height]
+    body = rr.LineStrips3D(lines, colors=[GREEN], radii=rr.Radius.ui_points(2.0))
+    stream.log("/world/robot/body", body, static=True)
+
+
+def _draw_places(
+    stream: rr.RecordingStream, places_m: Sequence[tuple[float, float]], labels: Sequence[str]
+) -> None:
+    """Labelled points on the floor, static; an empty list draws nothing."""
+    if not places_m:
+        return
+    at = _raised(_places(places_m), 4.0 * LINE_Z)
+    dots = rr.Points3D(at, colors=[VERMILION], radii=rr.Radius.ui_points(2.5))
+    stream.log("/world/result/sources", dots, static=True)
+    rings = rr.LineStrips3D(
+        list(_circle(RING_M) + at[:, None, :]),
+        colors=[VERMILION],
+        radii=rr.Radius.ui_points(1.5),
+    )
+    stream.log("/world/result/source_rings", rings, static=True)
+    # a label has the colour of its point: white ones are read best, and need no dot
+    names = rr.Points3D(at, colors=[WHITE], radii=[0.0], labels=labels, show_labels=True)
+    stream.log("/world/result/source_labels", names, static=True)
+
+
+def _grid(
+    rgba: NDArray[np.uint8], cell_m: float, corner_m: tuple[float, float], z_m: float
+) -> rr.GridMap:
+    """A picture on the floor; the rows of a `GridMap` run from the top down."""
+    rows, columns = rgba.shape[:2]
+    is_opaque = bool((rgba[..., 3] == 255).all())
+    form = rr.components.ImageFormat(
+        width=columns, height=rows, color_model="RGBA", channel_datatype="U8"
+    )
+    return rr.GridMap(
+        data=np.ascontiguousarray(rgba[::-1]).tobytes(),
+        format=form,
+        cell_size=cell_m,
+        translation=[*corner_m, z_m],
+        opacity=None if is_opaque else 0.999,  # below 1, or what is transparent is drawn black
+        draw_order=z_m,
+    )
+
+
+def _coloured(share: FloatArray, colours: str) -> NDArray[np.uint8]:
+    """Colours of a scale from 0 to 1, shape (H, W, 4); NaN is transparent."""
+    seen = ~np.isnan(share)
+    rgba = np.asarray(colormaps[colours](np.where(seen, share, 0.0), bytes=True), dtype=np.uint8)
+    rgba[~seen] = 0
+    return rgba
+
+
+def _stretches(wanted: NDArray[np.bool_]) -> list[slice]:
+    """Unbroken parts of a way between poses that are all wanted; a lone pose makes none."""
+    edges = np.diff(np.concatenate([[0], wanted.astype(np.int8), [0]]))
+    starts, ends = np.flatnonzero(edges > 0), np.flatnonzero(edges < 0)
+    return [slice(s, e) for s, e in zip(starts, ends, strict=True) if e - s > 1]
+
+
+def _broken_at_gaps(
+    time_ns: NDArray[np.int64], values: FloatArray
+) -> tuple[NDArray[np.int64], FloatArray]:
+    """A NaN after each scan that is followed by a gap, so that no line is drawn over it."""
+    if len(time_ns) < 3:
+        return time_ns, values
+    step = np.diff(time_ns)
+    before = np.flatnonzero(step > 3 * np.median(step)) + 1
+    return (
+        np.insert(time_ns, before, time_ns[before - 1] + 1),
+        np.insert(values, before, np.nan),
+    )
+
+
+def _bounding_area(points: FloatArray, frame: GridFrame) -> Area:
+    """The rectangle round points, one cell wide at least."""
+    if len(points) == 0:
+        points = np.array([frame.origin_m]) + 0.5 * frame.resolution_m
+    (left, bottom), (right, top) = points.min(axis=0), points.max(axis=0)
+    return Area(float(left), float(right), float(bottom), float(top))
+
+
+def _circle(radius_m: float) -> FloatArray:
+    """A closed line round the origin, flat, shape (41, 3)."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 41)
+    return _raised(radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1), 0.0)
+
+
+def _raised(points: FloatArray, z_m: float) -> FloatArray:
+    """x, y, z from x, y, any leading axes."""
+    return np.concatenate([points, np.full((*points.shape[:-1], 1), z_m)], axis=-1)
+
+
+def _places(places: Sequence[tuple[float, float]]) -> FloatArray:
+    return np.array(places, dtype=np.float64).reshape(-1, 2)
