@@ -34,7 +34,7 @@ def run_view(report: Mapping[str, Any]) -> RenderableType:
                 "Trajectory": f"{way['length_m']:.2f} m, {way['poses']} poses, {usable} usable",
                 "Used": ", ".join(f"{count} {_words(name)}" for name, count in _counts(report)),
                 "Time": _times(report["timings_s"]),
-                "Files": f"{report['folder']}/",
+                "Files": f"{report['folder']}/, to begin with report.html",
             }
         ),
         *_losses(report["losses"]),
@@ -55,7 +55,7 @@ def diff_view(report: Mapping[str, Any]) -> RenderableType:
                 "Cells": f"{counts['cells_compared']} compared, "
                 f"{counts['cells_without_background']} of them with the background's median",
                 "Time": _times(report["timings_s"]),
-                "Files": f"{report['folder']}/",
+                "Files": f"{report['folder']}/, to begin with report.html",
             }
         ),
     )

@@ -30,7 +30,7 @@ def test_the_summary_of_a_run_names_everything_a_person_asks_for():
     assert ["S1", "3.125", "0.275", "-64.0", "22"] in rows
     assert "400 poses, 90.0 % usable" in text
     assert "localize 1.25 s" in text
-    assert "out/run1/" in text
+    assert "out/run1/, to begin with report.html" in text
     assert all(word in " ".join(text.split()) for word in ("1294", "/odom", "lost", "note"))
 
 
