@@ -153,9 +153,10 @@ class RunRecording:
     def _draw_uncertainty(self) -> None:
         """The ellipse that holds the robot's place with two standard deviations."""
         trajectory = self._run.trajectory
-        if trajectory.covariance is None:
+        covariance: FloatArray | None = getattr(trajectory, "covariance", None)
+        if covariance is None:
             return
-        values, axes = np.linalg.eigh(trajectory.covariance[:, :2, :2])
+        values, axes = np.linalg.eigh(covariance[:, :2, :2])
         reach = ELLIPSE_SIGMAS * np.sqrt(np.maximum(values, 0.0))
         ellipses = (_circle(1.0)[:, :2] * reach[:, None, :]) @ np.swapaxes(axes, 1, 2)
         at = ellipses + trajectory.pose[:, None, :2]

@@ -179,8 +179,9 @@ def _audio_scan_arrays(scans: AudioScans) -> dict[str, ArrayLike]:
 def _trajectory_arrays(trajectory: Trajectory) -> dict[str, ArrayLike]:
     """What the TUM format cannot say, too: which poses may be trusted, and how far."""
     known: dict[str, ArrayLike] = {}
-    if trajectory.covariance is not None:
-        known["covariance"] = trajectory.covariance
+    covariance: FloatArray | None = getattr(trajectory, "covariance", None)
+    if covariance is not None:
+        known["covariance"] = covariance
     return {
         "time_ns": trajectory.time_ns,
         "pose": trajectory.pose,

@@ -220,8 +220,8 @@ def _audio_scans(stored: Stored) -> AudioScans:
 
 
 def _trajectory(stored: Stored) -> Trajectory:
-    covariance = stored.get("covariance")
-    return Trajectory(stored["time_ns"], stored["pose"], stored["usable"], covariance)
+    names = ("time_ns", "pose", "usable", *(["covariance"] if "covariance" in stored else []))
+    return Trajectory(**{name: stored[name] for name in names})
 
 
 def _frame(stored: Stored, cells: NDArray[Any]) -> GridFrame:
