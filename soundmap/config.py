@@ -156,6 +156,9 @@ class LocalizeConfig(Table):
     """Rays of a scan are not independent: their joint likelihood is raised to this power."""
     resample_share: Share = 0.5
     """Resample when the effective number of particles falls below this share."""
+    smoothing: bool = True
+    """Move all poses to where odometry and laser scans of the whole run fit best; without it the
+    trajectory is the particle filter's, as in the paper."""
     max_spread_m: Positive = 0.20
     """The sound map is updated only while the particles stand within this spread [m] ..."""
     max_spread_rad: Positive = math.radians(5.0)

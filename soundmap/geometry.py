@@ -195,14 +195,19 @@ class Trajectory:
         x [m], y [m], heading [rad] of the base in the frame of the trajectory (map or odometry).
     usable : ndarray of bool, shape (K,)
         Whether the pose may be trusted: particles concentrated and laser scans matching the map.
+    covariance : ndarray, shape (K, 3, 3), or None
+        Of x, y [m] and heading [rad], where it is known.
     """
 
     time_ns: NDArray[np.int64]
     pose: FloatArray
     usable: NDArray[np.bool_]
+    covariance: FloatArray | None = None
 
     def __post_init__(self) -> None:
         count = len(self.time_ns)
+        if self.covariance is not None and self.covariance.shape != (count, 3, 3):
+            raise ValueError("a trajectory needs one covariance (3, 3) a time")
         if self.pose.shape != (count, 3) or self.usable.shape != (count,):
             raise ValueError("a trajectory needs one pose (3,) and one flag a time")
         if count and not (np.all(np.diff(self.time_ns) > 0) and np.all(np.isfinite(self.pose))):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -78,3 +79,12 @@ class OccupancyGrid:
     def __post_init__(self) -> None:
         if self.occupied.shape != self.frame.shape or self.free.shape != self.frame.shape:
             raise ValueError("occupancy needs one value a cell")
+
+    @cached_property
+    def clearance_cells(self) -> NDArray[np.float32]:
+        """Distance from the centre of each cell to that of the nearest occupied one [cells]."""
+        from scipy.ndimage import distance_transform_edt
+
+        if not self.occupied.any():
+            return np.full(self.frame.shape, float(sum(self.frame.shape)), dtype=np.float32)
+        return np.asarray(distance_transform_edt(~self.occupied), dtype=np.float32)

@@ -20,10 +20,13 @@ COARSE_STEP_M = 0.2
 COARSE_HEADINGS = 72
 COARSE_SIGMA_M = 0.25
 FINE_SIGMA_M = 0.10
-CANDIDATES = 3000
+CANDIDATES = 1200
 MODES = 40
 SCORE_MARGIN = 0.25
 """A pose whose score is this much (of 1) below the best is no hypothesis."""
+NEARBY_M = np.linspace(-0.3, 0.3, 7)
+NEARBY_RAD = np.radians(np.linspace(-25.0, 25.0, 21))
+"""Window of a search about a guess."""
 CLEARANCE_M = 0.15
 """The base stands at least this far from every wall."""
 
@@ -44,7 +47,7 @@ def start_hypotheses(room: OccupancyGrid, rays: Rays) -> tuple[FloatArray, Float
     score : ndarray, shape (K,)
         Between 0 and 1.
     """
-    distance = _distance_to_wall(room)
+    distance = room.clearance_cells * np.float32(room.frame.resolution_m)
     places = _places(room, distance)
     if len(places) == 0 or len(rays) == 0:
         return np.empty((0, 3)), np.empty(0)
@@ -61,11 +64,31 @@ def start_hypotheses(room: OccupancyGrid, rays: Rays) -> tuple[FloatArray, Float
     return _separate_modes(pose, score)
 
 
-def _distance_to_wall(room: OccupancyGrid) -> NDArray[np.float32]:
-    from scipy.ndimage import distance_transform_edt
+class NearbySearch:
+    """Looks for the pose that fits a scan best within a window about a guess.
 
-    distance = distance_transform_edt(~room.occupied) * room.frame.resolution_m
-    return np.asarray(distance, dtype=np.float32)
+    For runs whose scans lie far apart, or whose odometry is worse than the particle filter was
+    told: a local fit would not find its way back from such a guess.
+    """
+
+    def __init__(self, room: OccupancyGrid) -> None:
+        resolution = room.frame.resolution_m
+        distance = room.clearance_cells * np.float32(resolution)
+        self._grid = (
+            _nearness_to_wall(distance, FINE_SIGMA_M),
+            np.array(room.frame.origin_m),
+            resolution,
+        )
+        axes = (NEARBY_M, NEARBY_M, NEARBY_RAD)
+        self._window = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+    def best(self, pose: FloatArray, rays: Rays) -> FloatArray:
+        """The best pose of the window about ``pose``, shape (3,), and then of finer steps."""
+        score = _pose_scores(*self._grid, pose + self._window, rays.end_m)
+        found = (pose + self._window)[[int(np.argmax(score))]]
+        for step_m in (0.05, 0.025):
+            found, _ = _climbed(self._grid, found, rays.end_m, step_m)
+        return found[0]
 
 
 def _nearness_to_wall(distance: NDArray[np.float32], sigma_m: float) -> NDArray[np.float32]:

@@ -67,7 +67,7 @@ def scan_log_likelihood(
         Sum over the rays of :math:`\ln p(z | z^*)`.
     """
     return _log_likelihood(
-        room.occupied,
+        room.clearance_cells,
         np.array(room.frame.origin_m),
         room.frame.resolution_m,
         np.ascontiguousarray(pose),
@@ -108,15 +108,20 @@ class Agreement:
 
     Attributes
     ----------
-    matched : float
-        Share of the returns that lie where the map shows a surface.
+    is_matched : ndarray of bool, shape (B,)
+        Which returns lie where the map shows a surface.
     beyond : float
         Share that lies behind a surface of the map: things may stand before a wall that the map
         lacks, but no ray passes through a wall that is there.
     """
 
-    matched: float
+    is_matched: NDArray[np.bool_]
     beyond: float
+
+    @property
+    def matched(self) -> float:
+        """Share of the returns that lie where the map shows a surface."""
+        return float(self.is_matched.mean()) if len(self.is_matched) else 0.0
 
 
 def scan_agreement(
@@ -127,7 +132,7 @@ def scan_agreement(
     ``tolerance_m`` is the greatest difference between measured and cast range of a match [m].
     """
     if len(rays) == 0:
-        return Agreement(0.0, 0.0)
+        return Agreement(np.zeros(0, dtype=bool), 0.0)
     origins = transformed(pose, rays.origin_m)
     bearings = rays.bearing_rad + pose[2]
     measured = rays.range_m
@@ -137,7 +142,7 @@ def scan_agreement(
     near = _near_occupied(room, composed(pose, _as_poses(rays.end_m))[:, :2])
     matched = (np.abs(measured - expected) < tolerance_m) | near
     beyond = ~matched & (measured > expected)
-    return Agreement(float(matched.mean()), float(beyond.mean()))
+    return Agreement(matched, float(beyond.mean()))
 
 
 def _as_poses(points: FloatArray) -> FloatArray:
@@ -155,7 +160,7 @@ def _near_occupied(room: OccupancyGrid, points: FloatArray) -> NDArray[np.bool_]
 
 @njit(cache=True, nogil=True)
 def _log_likelihood(
-    occupied: NDArray[np.bool_],
+    clearance: NDArray[np.float32],
     grid_origin: FloatArray,
     resolution: float,
     pose: FloatArray,
@@ -179,7 +184,7 @@ def _log_likelihood(
             # Beyond the measured range plus a few sigma the exact value no longer matters.
             limit = min(measured[ray] + 6.0 * sigma, range_max)
             expected = resolution * walked_range(
-                occupied,
+                clearance,
                 (start_x - grid_origin[0]) / resolution,
                 (start_y - grid_origin[1]) / resolution,
                 np.cos(angle),

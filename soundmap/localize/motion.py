@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from soundmap.config import LocalizeConfig
 from soundmap.geometry import FloatArray, wrapped_angle
 
 SMALLEST_STEP_M = 0.005
@@ -36,6 +37,16 @@ class MotionNoise:
     turn_per_metre: float
     distance_per_metre: float
     distance_per_turn: float
+
+
+def motion_noise(config: LocalizeConfig) -> MotionNoise:
+    """The noise that the configuration states."""
+    return MotionNoise(
+        config.noise_turn_per_turn,
+        config.noise_turn_per_metre,
+        config.noise_distance_per_metre,
+        config.noise_distance_per_turn,
+    )
 
 
 def moved(

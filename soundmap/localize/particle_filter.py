@@ -14,7 +14,7 @@ from soundmap.localize.likelihood import (
     scan_agreement,
     scan_log_likelihood,
 )
-from soundmap.localize.motion import MotionNoise, moved
+from soundmap.localize.motion import motion_noise, moved
 from soundmap.localize.particles import (
     Particles,
     PoseEstimate,
@@ -62,12 +62,7 @@ class ParticleFilter:
             config.short_decay_per_m,
             range_max_m,
         )
-        self._noise = MotionNoise(
-            config.noise_turn_per_turn,
-            config.noise_turn_per_metre,
-            config.noise_distance_per_metre,
-            config.noise_distance_per_turn,
-        )
+        self._noise = motion_noise(config)
         count = config.particles if len(hypotheses) == 1 else config.global_particles
         around = np.resize(hypotheses, (max(count, len(hypotheses)), 3))
         pose = around + SEED_SIGMA * rng.standard_normal(around.shape)

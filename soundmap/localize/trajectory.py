@@ -1,58 +1,37 @@
-"""From odometry and laser scans to the robot's trajectory in the geometric map. Sect. 2.2.
-
-While the particles do not agree, what was seen is kept, and once they do, the filter runs back over
-it: a whole run is at hand, so its beginning need not be lost.
-"""
+"""From odometry and laser scans to the robot's trajectory in the geometric map. Sect. 2.2."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from copy import copy
-from dataclasses import dataclass
+from dataclasses import replace
 from itertools import chain
 
 import numpy as np
+from numpy.typing import NDArray
 
 from soundmap.config import LocalizeConfig
 from soundmap.errors import MapError
-from soundmap.geometry import FloatArray, Trajectory, composed, relative
+from soundmap.geometry import FloatArray, Trajectory, relative
 from soundmap.grid import OccupancyGrid
-from soundmap.localize.global_start import start_hypotheses
-from soundmap.localize.likelihood import Agreement
-from soundmap.localize.particle_filter import ParticleFilter
-from soundmap.localize.views import STAGE, View, chosen_views, joined_rays
+from soundmap.localize.global_start import NearbySearch
+from soundmap.localize.likelihood import Agreement, scan_agreement
+from soundmap.localize.smoothing import SmoothedPoses, carried, smoothed_poses
+from soundmap.localize.tracking import FIRST_MATCH, MOST_BEYOND, OPENING_NS, Fix, Tracker
+from soundmap.localize.views import STAGE, View, chosen_views
+from soundmap.localize.wall_fit import WallFit
 from soundmap.losses import LossLedger
+from soundmap.odometry_model import OdometryModel, fitted_odometry
 from soundmap.sensors import LaserScan
 
-LOST_AFTER_S = 2.0
-"""Without a match for this long, the pose is sought in the whole map."""
-ODOMETRY_DRIFT = 0.2
-"""Worst drift of any odometry in use [m/m and rad/m]."""
-FIRST_MATCH = 0.6
-"""Share of a scan that must match before any pose of the run is trusted."""
-ELSEWHERE_MATCH = 0.8
-"""Share of a scan that must match to believe that the robot is where odometry cannot have led."""
-MOST_BEYOND = 0.10
-"""Share of a scan that may lie behind the map's walls where a pose has to be proved."""
-OPENING_NS = 300_000_000
-"""Scans this close together are matched to the map as one."""
-MOST_PENDING = 20_000
-"""Scans kept while the particles do not agree; bounds the memory of a run that stays lost."""
-
-
-@dataclass(frozen=True)
-class Fix:
-    """The pose found for a view, how the map agrees with it there, and whether to trust it."""
-
-    view: View
-    pose: FloatArray
-    agreement: Agreement
-    usable: bool
-
-    @property
-    def time_ns(self) -> int:
-        """Time of the pose [ns since epoch]."""
-        return self.view.time_ns
+UNKNOWN_ODOMETRY = OdometryModel(
+    noise_distance_per_metre=0.3, noise_turn_per_metre=0.2, noise_turn_per_turn=0.3
+)
+"""What is believed of the odometry before the run has shown how good it is: not much."""
+POOR_MATCH = 0.9
+CLEARLY_BETTER = 0.10
+"""Below the first share of matched returns a better pose is sought nearby; by how much better."""
+ROUNDS = 4
+"""Times that all poses are smoothed and it is judged anew which of them to trust."""
 
 
 def estimate_trajectory(
@@ -95,12 +74,15 @@ def estimate_trajectory(
     """
     losses = LossLedger() if losses is None else losses
     views = chosen_views(lasers, odometry, config, losses)
-    localizer = _Localizer(room, config, np.random.default_rng(config.seed), losses)
+    tracker = Tracker(room, config, np.random.default_rng(config.seed), losses)
     opening = _opening(views)
-    localizer.start(opening, None if start_pose is None else np.array(start_pose))
+    tracker.start(opening, None if start_pose is None else np.array(start_pose))
     for view in chain(opening, views):
-        localizer.add(view)
-    return _checked(localizer.fixes, room, losses)
+        tracker.add(view)
+    fixes = sorted(tracker.fixes, key=lambda fix: fix.time_ns)
+    if config.smoothing and any(fix.usable for fix in fixes):
+        fixes = _smoothed(fixes, room, config)
+    return _checked(fixes, room, losses)
 
 
 def _opening(views: Iterator[View]) -> list[View]:
@@ -108,145 +90,114 @@ def _opening(views: Iterator[View]) -> list[View]:
     opening = [next(views)]
     for view in views:
         opening.append(view)
-        if view.time_ns - opening[0].rays.time_ns > OPENING_NS:
+        if view.time_ns - opening[0].time_ns > OPENING_NS:
             break
     return opening
 
 
-class _Localizer:
-    """Runs the particle filter over the views; seeks the pose in the whole map when it is lost."""
-
-    def __init__(
-        self,
-        room: OccupancyGrid,
-        config: LocalizeConfig,
-        rng: np.random.Generator,
-        losses: LossLedger,
-    ) -> None:
-        self._room, self._config, self._rng, self._losses = room, config, rng, losses
-        self._filter: ParticleFilter | None = None
-        self._odometry = np.zeros(3)
-        self._pending: list[tuple[int, View]] = []
-        self._anchor: Fix | None = None
-        self._recent: dict[int, View] = {}
-        self._matched_ns = 0
-        self._patience_s = LOST_AFTER_S
-        self.fixes: list[Fix] = []
-
-    def start(self, opening: list[View], start_pose: FloatArray | None) -> None:
-        """Place the particles, from a given pose or by a search with the first views."""
-        first = opening[0]
-        if start_pose is None:
-            hypotheses, _ = start_hypotheses(self._room, joined_rays(opening, first))
-            if len(hypotheses) == 0:
-                raise MapError("the map has no free space in which the robot could stand.")
-        else:
-            hypotheses = start_pose[None, :]
-        self._filter = self._seeded(hypotheses, first)
-        self._odometry, self._matched_ns = first.odometry, first.rays.time_ns
-
-    def add(self, view: View) -> None:
-        """Use one more scan."""
-        if self._filter is None:
-            raise ValueError("start the localizer first")
-        self._filter.predict(relative(self._odometry, view.odometry))
-        self._odometry = view.odometry
-        self._recent[view.scanner] = view
-        if view.is_evidence:
-            self._filter.correct(view.rays)
-        fix = self._fix(self._filter, view)
-        self.fixes.append(fix)
-        self._anchor = fix if fix.usable else self._anchor
-        if fix.agreement.matched >= self._config.min_match:
-            self._matched_ns, self._patience_s = view.time_ns, LOST_AFTER_S
-        if fix.usable:
-            self._look_back(self._filter)
-            return
-        if len(self._pending) < MOST_PENDING:
-            self._pending.append((len(self.fixes) - 1, view))
-        if (view.time_ns - self._matched_ns) * 1e-9 > self._patience_s:
-            self._seek(view, fix.pose)
-
-    def _seeded(self, hypotheses: FloatArray, view: View) -> ParticleFilter:
-        return ParticleFilter(
-            self._room,
-            hypotheses,
-            self._config,
-            range_max_m=view.range_max_m,
-            rng=self._rng,
-        )
-
-    def _fix(self, particle_filter: ParticleFilter, view: View) -> Fix:
-        estimate = particle_filter.estimate()
-        agreement = particle_filter.agreement(estimate, view.rays)
-        usable = particle_filter.concentrated(estimate) and self._believed(
-            view, estimate.pose, agreement
-        )
-        return Fix(view, estimate.pose, agreement, usable)
-
-    def _believed(self, view: View, pose: FloatArray, agreement: Agreement) -> bool:
-        """Whether the scan speaks for the pose, the more so the less is known of the run."""
-        needed, most_beyond = self._config.min_match, 1.0
-        if self._anchor is None:
-            needed, most_beyond = max(needed, FIRST_MATCH), MOST_BEYOND
-        elif not _consistent(self._anchor, view, pose):
-            needed, most_beyond = max(needed, ELSEWHERE_MATCH), MOST_BEYOND
-        return agreement.matched >= needed and agreement.beyond <= most_beyond
-
-    def _look_back(self, particle_filter: ParticleFilter) -> None:
-        """Run back over the views that came before the particles agreed."""
-        pending, self._pending = self._pending, []
-        backward, odometry = copy(particle_filter), self._odometry
-        for index, view in reversed(pending):
-            backward.predict(relative(odometry, view.odometry))
-            odometry = view.odometry
-            if view.is_evidence:
-                backward.correct(view.rays)
-            fix = self._fix(backward, view)
-            if fix.usable:
-                self.fixes[index] = fix
-
-    def _seek(self, view: View, expected: FloatArray) -> None:
-        """Search the whole map; the pose expected from odometry stays a hypothesis."""
-        near = [
-            recent
-            for recent in self._recent.values()
-            if abs(recent.rays.time_ns - view.time_ns) < OPENING_NS
+def _smoothed(fixes: list[Fix], room: OccupancyGrid, config: LocalizeConfig) -> list[Fix]:
+    """The fixes moved to their most likely poses given the whole run, and judged again there."""
+    fixes = _moved_nearby(fixes, room, config)
+    views = [fix.view for fix in fixes]
+    odometry = np.array([view.odometry for view in views])
+    reported = relative(odometry[:-1], odometry[1:])
+    agreements = [fix.agreement for fix in fixes]
+    pose = np.array([fix.pose for fix in fixes])
+    trusted = np.array([fix.usable for fix in fixes])
+    walls, model = WallFit(room, config), UNKNOWN_ODOMETRY
+    for round_ in range(ROUNDS):
+        step = model.corrected(reported)
+        weight = model.information(np.hypot(step[:, 0], step[:, 1]), np.abs(step[:, 2]))
+        pose = carried(pose, step, trusted)
+        points = [
+            view.rays.end_m[agreement.is_matched & usable]
+            for view, agreement, usable in zip(views, agreements, trusted, strict=True)
         ]
-        hypotheses, _ = start_hypotheses(self._room, joined_rays(near, view))
-        self._filter = self._seeded(np.vstack([hypotheses, expected]), view)
-        self._matched_ns, self._patience_s = view.time_ns, 2.0 * self._patience_s
-        self._losses.remark(
-            "laser scans stopped matching the map",
-            STAGE,
-            effect="pose sought in the whole map",
+        result = smoothed_poses(
+            step, weight, pose, walls.evidence(points, pose, by_lines=round_ > 0)
         )
+        pose = result.pose
+        agreements = [
+            _agreement(room, at, view, config) for at, view in zip(pose, views, strict=True)
+        ]
+        trusted = _trusted(agreements, result, trusted, config)
+        if round_ == 0:  # later poses follow the odometry and cannot judge it
+            both = trusted[:-1] & trusted[1:]
+            found = relative(pose[:-1], pose[1:])
+            model = _not_too_sure(fitted_odometry(reported[both], found[both], model), config)
+    return [
+        Fix(view, at, agreement, bool(usable), covariance)
+        for view, at, agreement, usable, covariance in zip(
+            views, pose, agreements, trusted, result.covariance, strict=True
+        )
+    ]
 
 
-def _consistent(anchor: Fix, view: View, pose: FloatArray) -> bool:
-    """Whether the odometry can have led from a trusted pose to this one."""
-    expected = composed(anchor.pose, relative(anchor.view.odometry, view.odometry))
-    driven_m = abs(view.driven_m - anchor.view.driven_m)
-    off = relative(expected, pose)
-    near = np.hypot(off[0], off[1]) <= 0.5 + ODOMETRY_DRIFT * driven_m
-    return bool(near and abs(off[2]) <= np.radians(20.0) + ODOMETRY_DRIFT * driven_m)
+def _moved_nearby(fixes: list[Fix], room: OccupancyGrid, config: LocalizeConfig) -> list[Fix]:
+    """The fixes that match poorly moved to where their scans match much better nearby, if so."""
+    search = NearbySearch(room)
+    moved = []
+    for fix in fixes:
+        if fix.agreement.matched < POOR_MATCH and len(fix.view.rays):
+            pose = search.best(fix.pose, fix.view.rays)
+            agreement = _agreement(room, pose, fix.view, config)
+            if agreement.matched > fix.agreement.matched + CLEARLY_BETTER:
+                proved = agreement.matched >= FIRST_MATCH and agreement.beyond <= MOST_BEYOND
+                fix = replace(fix, pose=pose, agreement=agreement, usable=proved)
+        moved.append(fix)
+    return moved
+
+
+def _agreement(
+    room: OccupancyGrid, pose: FloatArray, view: View, config: LocalizeConfig
+) -> Agreement:
+    return scan_agreement(room, pose, view.rays, tolerance_m=3.0 * config.hit_sigma_m)
+
+
+def _not_too_sure(model: OdometryModel, config: LocalizeConfig) -> OdometryModel:
+    """The model with no less noise than the particle filter assumes."""
+    return replace(
+        model,
+        noise_distance_per_metre=max(
+            model.noise_distance_per_metre, config.noise_distance_per_metre
+        ),
+        noise_turn_per_metre=max(model.noise_turn_per_metre, config.noise_turn_per_metre),
+        noise_turn_per_turn=max(model.noise_turn_per_turn, config.noise_turn_per_turn),
+    )
+
+
+def _trusted(
+    agreements: list[Agreement],
+    result: SmoothedPoses,
+    before: NDArray[np.bool_],
+    config: LocalizeConfig,
+) -> NDArray[np.bool_]:
+    """Poses that are known well enough and whose scans match; new ones have to match better."""
+    matched = np.array([agreement.matched for agreement in agreements])
+    beyond = np.array([agreement.beyond for agreement in agreements])
+    proved = (matched >= FIRST_MATCH) & (beyond <= MOST_BEYOND)
+    variance = np.diagonal(result.covariance, axis1=1, axis2=2)
+    near = np.sqrt(variance[:, 0] + variance[:, 1]) <= config.max_spread_m
+    near &= np.sqrt(variance[:, 2]) <= config.max_spread_rad
+    return near & np.where(before, matched >= config.min_match, proved)
 
 
 def _checked(fixes: list[Fix], room: OccupancyGrid, losses: LossLedger) -> Trajectory:
-    """The fixes as a trajectory; an error if none of them may be trusted."""
-    fixes = sorted(fixes, key=lambda fix: fix.time_ns)
+    """The fixes, ordered by time, as a trajectory; an error if none of them may be trusted."""
     time_ns = np.array([fix.time_ns for fix in fixes], dtype=np.int64)
-    last_of_its_time = np.append(np.diff(time_ns) > 0, True)
-    trajectory = Trajectory(
-        time_ns[last_of_its_time],
-        np.array([fix.pose for fix in fixes])[last_of_its_time],
-        np.array([fix.usable for fix in fixes])[last_of_its_time],
-    )
-    lost = int(np.count_nonzero(~trajectory.usable))
-    if lost == len(trajectory):
+    last_of_its_time = np.flatnonzero(np.append(np.diff(time_ns) > 0, True))
+    kept = [fixes[index] for index in last_of_its_time]
+    lost = sum(not fix.usable for fix in kept)
+    if lost == len(kept):
         raise MapError(_why_lost(fixes, room))
     losses.add("robot not localized", STAGE, effect="sound not fused", count=lost)
-    return trajectory
+    smoothed = all(fix.covariance is not None for fix in kept)
+    return Trajectory(
+        time_ns[last_of_its_time],
+        np.array([fix.pose for fix in kept]),
+        np.array([fix.usable for fix in kept]),
+        np.array([fix.covariance for fix in kept]) if smoothed else None,
+    )
 
 
 def _why_lost(fixes: list[Fix], room: OccupancyGrid) -> str:

@@ -22,9 +22,9 @@ from soundmap.mapping.key_scans import STAGE, KeyScan, KeyScans, chosen_key_scan
 from soundmap.mapping.links import odometry_links
 from soundmap.mapping.loops import LoopSearch, close_loops
 from soundmap.mapping.occupancy import drawn_map
-from soundmap.mapping.odometry_model import OdometryModel, fitted_odometry
 from soundmap.mapping.pose_graph import Links, link_errors, solved_graph
 from soundmap.mapping.relaxation import relaxed_poses
+from soundmap.odometry_model import OdometryModel, fitted_odometry
 from soundmap.sensors import LaserScan
 
 LOOP_EVERY_M = 0.5

@@ -17,8 +17,8 @@ from soundmap.mapping.alignment import PointStore, aligned_scan, pair_fits
 from soundmap.mapping.correlation import best_placement, nearness_grid
 from soundmap.mapping.key_scans import KeyScan
 from soundmap.mapping.links import odometry_links, scan_links
-from soundmap.mapping.odometry_model import OdometryModel
 from soundmap.mapping.pose_graph import Links
+from soundmap.odometry_model import OdometryModel
 
 REACH_M = 5.0
 """Scans this near are likely to see the same surfaces."""

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from soundmap.geometry import FloatArray, relative
 from soundmap.mapping.alignment import PairFits
 from soundmap.mapping.key_scans import KeyScan
-from soundmap.mapping.odometry_model import OdometryModel
 from soundmap.mapping.pose_graph import Links
+from soundmap.odometry_model import OdometryModel
 
 PAIR_SIGMA = np.array([0.01, 0.01, np.radians(0.2)])
 """No two scans tell their relative pose better than this [m, m, rad]: mounts, tilt, timing."""

@@ -208,3 +208,34 @@ class TestFaults:
         estimate = estimate_trajectory(SCANS, cut, ROOM, CONFIG, start_pose=START, losses=losses)
         assert estimate.time_ns[-1] <= cut.time_ns[-1]
         assert next(iter(losses)).what == "laser scan without odometry"
+
+
+def test_smoothing_brings_the_poses_nearer_to_the_truth():
+    odometry = odometry_of(TRUTH, scale=1.03, turn_scale=0.98, drift_rad_per_m=np.radians(2.0))
+    plain, smoothed = (
+        estimate_trajectory(SCANS, odometry, ROOM, CONFIG.model_copy(update={"smoothing": on}))
+        for on in (False, True)
+    )
+    plain_off, smoothed_off = errors(plain), errors(smoothed)
+    assert np.median(smoothed_off[0]) < 0.7 * np.median(plain_off[0])
+    assert np.median(smoothed_off[0]) < 0.006
+    assert np.degrees(smoothed_off[1].mean()) < 0.15
+    assert plain.covariance is None
+    assert smoothed.covariance.shape == (len(smoothed), 3, 3)
+
+
+def test_scans_far_apart_with_poor_odometry_are_still_aligned():
+    """One scan in 0.7 m, and odometry that misses up to ten degrees between them."""
+    rng = np.random.default_rng(5)
+    sparse = [scan for scan in SCANS if scan.scanner == 0][::28]
+    step = relative(TRUTH.pose[:-1], TRUTH.pose[1:])
+    step[:, 2] += rng.normal(0, 0.004, len(step)) + 0.05 * np.hypot(step[:, 0], step[:, 1])
+    pose = [np.zeros(3)]
+    for part in step:
+        pose.append(composed(pose[-1], part))
+    odometry = Trajectory(TRUTH.time_ns, np.array(pose), TRUTH.usable)
+    estimate = estimate_trajectory(sparse, odometry, ROOM, CONFIG, start_pose=START)
+    position, heading = errors(estimate)
+    assert np.median(position[estimate.usable]) < 0.03
+    assert np.degrees(heading[estimate.usable].mean()) < 0.8
+    assert estimate.usable.mean() > 0.9

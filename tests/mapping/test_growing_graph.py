@@ -2,7 +2,7 @@ import numpy as np
 from scipy.sparse.csgraph import floyd_warshall
 
 from soundmap.mapping.growing_graph import GrowingGraph
-from soundmap.mapping.odometry_model import OdometryModel
+from soundmap.odometry_model import OdometryModel
 from tests import worlds
 from tests.mapping import drives
 

@@ -3,7 +3,7 @@ import numpy as np
 from soundmap.geometry import relative
 from soundmap.mapping.alignment import PairFits
 from soundmap.mapping.links import PAIR_SIGMA, odometry_links, scan_links
-from soundmap.mapping.odometry_model import OdometryModel
+from soundmap.odometry_model import OdometryModel
 from tests import worlds
 from tests.mapping import drives
 

@@ -9,7 +9,7 @@ import pytest
 from soundmap.geometry import composed
 from soundmap.mapping.growing_graph import GrowingGraph
 from soundmap.mapping.loops import close_loops, recent_view, seen_through_share
-from soundmap.mapping.odometry_model import OdometryModel
+from soundmap.odometry_model import OdometryModel
 from tests import worlds
 from tests.mapping import drives
 

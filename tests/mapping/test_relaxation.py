@@ -2,9 +2,9 @@ import numpy as np
 
 from soundmap.geometry import composed
 from soundmap.mapping.links import odometry_links
-from soundmap.mapping.odometry_model import OdometryModel
 from soundmap.mapping.pose_graph import link_costs
 from soundmap.mapping.relaxation import overlapping_pairs, relaxed_poses
+from soundmap.odometry_model import OdometryModel
 from tests import worlds
 from tests.mapping import drives
 

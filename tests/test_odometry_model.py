@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from soundmap.geometry import relative
-from soundmap.mapping.odometry_model import OdometryModel, fitted_odometry
+from soundmap.odometry_model import OdometryModel, fitted_odometry
 from tests import worlds
 from tests.mapping import drives
 

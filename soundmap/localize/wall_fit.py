@@ -1,0 +1,70 @@
+"""What the laser scans of a run say about its poses, given the walls: first by the map alone."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from soundmap.config import LocalizeConfig
+from soundmap.geometry import FloatArray, transformed
+from soundmap.grid import OccupancyGrid
+from soundmap.localize.map_fit import point_pull, surface_field
+from soundmap.localize.smoothing import ScanEvidence
+from soundmap.localize.wall_lines import has_line, line_pull, surface_cells, wall_lines
+
+KERNEL_M = 0.15
+"""Width of the robust kernel of the points that the map explains [m]."""
+MAP_SHARE = 0.1
+"""Weight that the map's own cells keep where the run's returns draw a line in them."""
+
+
+class WallFit:
+    """Fits laser points to the walls of a map.
+
+    To its cells while the poses are rough; then to the lines that the run's returns draw in them,
+    with a weak pull of the cells, so that lines and poses do not drift together.
+    """
+
+    def __init__(self, room: OccupancyGrid, config: LocalizeConfig) -> None:
+        self._field, self._surface = surface_field(room), surface_cells(room)
+        self._sigma_m, self._independence = config.hit_sigma_m, config.likelihood_exponent
+
+    def evidence(
+        self, points_m: list[FloatArray], pose: FloatArray, *, by_lines: bool
+    ) -> ScanEvidence:
+        """Information and pull of the points on any poses.
+
+        Parameters
+        ----------
+        points_m : list of ndarray, shapes (P_k, 2)
+            Returns that count, in the base frame of each pose [m].
+        pose : ndarray, shape (K, 3)
+            Best poses so far: lines are drawn from there.
+        by_lines : bool
+            Fit to lines as well as to cells.
+        """
+        first = np.concatenate([[0], np.cumsum([len(points) for points in points_m])])
+        first, flat = first.astype(np.int64), np.concatenate(points_m)
+        sigma_m, weight = self._sigma_m, self._independence
+
+        share = np.ones(len(flat))
+
+        def by_map(at: FloatArray) -> tuple[FloatArray, FloatArray]:
+            information, pull = point_pull(
+                self._field, at, flat, first, share, sigma_m=sigma_m, kernel_m=KERNEL_M
+            )
+            return weight * information, weight * pull
+
+        if not by_lines:
+            return by_map
+        points = transformed(np.repeat(pose, np.diff(first), axis=0), flat)
+        lines = wall_lines(self._surface, points)
+        share[has_line(self._surface, lines, points)] = MAP_SHARE
+
+        def by_both(at: FloatArray) -> tuple[FloatArray, FloatArray]:
+            information, pull = line_pull(
+                self._surface, lines, at, flat, first, sigma_m=sigma_m, kernel_m=KERNEL_M
+            )
+            map_information, map_pull = by_map(at)
+            return weight * information + map_information, weight * pull + map_pull
+
+        return by_both

@@ -1,0 +1,241 @@
+"""Where exactly the walls stand, learned from the run itself.
+
+A cell of the map says only that a surface is somewhere within 5 cm. The laser returns of the whole
+run say where: those about each surface cell are fitted by a short line, and poses are then matched
+to the lines instead of the cells. The lines of a run and its poses could still drift together, so
+the map keeps a weak pull of its own (surface elements as in Biber and Strasser, "The normal
+distributions transform", IROS 2003).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from soundmap.geometry import FloatArray
+from soundmap.grid import OccupancyGrid
+
+REACH_M = 0.15
+"""Returns farther than this from a surface cell do not belong to it."""
+LEAST_POINTS = 6
+FLATNESS = 0.2
+"""Greatest ratio of the variances across and along a line that still is one."""
+
+
+@dataclass(frozen=True)
+class SurfaceCells:
+    """The cells of the map that rays can hit, and which of them is nearest to any cell.
+
+    Attributes
+    ----------
+    nearest : ndarray of int32, shape (H, W)
+        Index of the nearest surface cell.
+    own : ndarray of int32, shape (H, W)
+        Index of the cell itself where it is a surface cell, else -1.
+    cell : ndarray of int64, shape (C, 2)
+        Row and column of each surface cell.
+    centre_m : ndarray, shape (C, 2)
+        [m, map frame]
+    corner_m : ndarray, shape (2,)
+        Lower-left corner of cell [0, 0] [m].
+    resolution_m : float
+    """
+
+    nearest: NDArray[np.int32]
+    own: NDArray[np.int32]
+    cell: NDArray[np.int64]
+    centre_m: FloatArray
+    corner_m: FloatArray
+    resolution_m: float
+
+
+@dataclass(frozen=True)
+class WallLines:
+    """A line at every surface cell that enough returns lie about.
+
+    Attributes
+    ----------
+    normal : ndarray, shape (C, 2)
+        Unit vectors; zero where there is no line.
+    offset_m : ndarray, shape (C,)
+        Points p of line c satisfy normal . p = offset [m].
+    """
+
+    normal: FloatArray
+    offset_m: FloatArray
+
+
+def surface_cells(room: OccupancyGrid) -> SurfaceCells:
+    """The surface cells of a map; the inside of a thick wall is no surface."""
+    from scipy.ndimage import binary_erosion, distance_transform_edt
+
+    surface = room.occupied & ~binary_erosion(room.occupied, border_value=1)
+    own = np.full(room.frame.shape, -1, dtype=np.int32)
+    cell = np.argwhere(surface)
+    own[surface] = np.arange(len(cell), dtype=np.int32)
+    row, column = distance_transform_edt(~surface, return_distances=False, return_indices=True)
+    return SurfaceCells(
+        own[row, column],
+        own,
+        cell,
+        room.frame.centres(cell),
+        np.array(room.frame.origin_m),
+        room.frame.resolution_m,
+    )
+
+
+def wall_lines(surface: SurfaceCells, points_m: FloatArray) -> WallLines:
+    """Lines through the returns about each surface cell and its neighbours.
+
+    Parameters
+    ----------
+    surface : SurfaceCells
+    points_m : ndarray, shape (P, 2)
+        Laser returns of the whole run in the map frame [m].
+    """
+    moments = _moments(
+        surface.nearest,
+        surface.centre_m,
+        surface.corner_m,
+        surface.resolution_m,
+        np.ascontiguousarray(points_m),
+        REACH_M,
+    )
+    count, x, y, xx, xy, yy = _with_neighbours(surface.own, surface.cell, moments).T
+    total = np.maximum(count, 1.0)
+    mean = np.stack([x, y], axis=-1) / total[:, None]
+    var_x, var_y = xx / total - mean[:, 0] ** 2, yy / total - mean[:, 1] ** 2
+    cov = xy / total - mean[:, 0] * mean[:, 1]
+    half_sum, half_gap = 0.5 * (var_x + var_y), np.hypot(0.5 * (var_x - var_y), cov)
+    along = 0.5 * np.arctan2(2.0 * cov, var_x - var_y)
+    flat = half_sum - half_gap <= FLATNESS * (half_sum + half_gap)
+    exists = (count >= LEAST_POINTS) & flat & (half_sum + half_gap > 1e-6)
+    normal = np.stack([-np.sin(along), np.cos(along)], axis=-1) * exists[:, None]
+    # Moments are taken about each cell's own lower-left corner of the map.
+    return WallLines(normal, np.sum(normal * (mean + surface.corner_m), axis=1))
+
+
+def has_line(surface: SurfaceCells, lines: WallLines, points_m: FloatArray) -> NDArray[np.bool_]:
+    """Whether the surface cell nearest to each point has a line, shape (P,); map frame [m]."""
+    cell = np.floor((points_m - surface.corner_m) / surface.resolution_m).astype(np.int64)[:, ::-1]
+    inside = np.all((cell >= 0) & (cell < surface.nearest.shape), axis=1)
+    row, column = np.where(inside[:, None], cell, 0).T
+    return inside & np.any(lines.normal[surface.nearest[row, column]] != 0.0, axis=1)
+
+
+def line_pull(
+    surface: SurfaceCells,
+    lines: WallLines,
+    pose: FloatArray,
+    points_m: FloatArray,
+    first: NDArray[np.int64],
+    *,
+    sigma_m: float,
+    kernel_m: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Normal equations of fitting the points of each pose to the lines nearest to them.
+
+    Parameters and results are those of `soundmap.localize.map_fit.point_pull`; points without a
+    line nearby do not count.
+    """
+    return _line_pull(
+        surface.nearest,
+        surface.corner_m,
+        surface.resolution_m,
+        lines.normal,
+        lines.offset_m,
+        np.ascontiguousarray(pose),
+        np.ascontiguousarray(points_m),
+        first,
+        sigma_m,
+        kernel_m,
+    )
+
+
+@njit(cache=True, nogil=True)
+def _moments(
+    nearest: NDArray[np.int32],
+    centre: FloatArray,
+    corner: FloatArray,
+    resolution: float,
+    points: FloatArray,
+    reach: float,
+) -> FloatArray:
+    """Count, sums and sums of products of the points nearest to each surface cell, (C, 6)."""
+    rows, columns = nearest.shape
+    moments = np.zeros((len(centre), 6))
+    for i in range(len(points)):
+        x, y = points[i, 0] - corner[0], points[i, 1] - corner[1]
+        column, row = int(np.floor(x / resolution)), int(np.floor(y / resolution))
+        if not (0 <= row < rows and 0 <= column < columns):
+            continue
+        cell = nearest[row, column]
+        if np.hypot(points[i, 0] - centre[cell, 0], points[i, 1] - centre[cell, 1]) > reach:
+            continue
+        moments[cell, 0] += 1.0
+        moments[cell, 1] += x
+        moments[cell, 2] += y
+        moments[cell, 3] += x * x
+        moments[cell, 4] += x * y
+        moments[cell, 5] += y * y
+    return moments
+
+
+@njit(cache=True, nogil=True)
+def _with_neighbours(
+    own: NDArray[np.int32], cell: NDArray[np.int64], moments: FloatArray
+) -> FloatArray:
+    """Moments of each surface cell together with those of the surface cells around it."""
+    rows, columns = own.shape
+    summed = np.zeros_like(moments)
+    for c in range(len(cell)):
+        for row in range(max(cell[c, 0] - 1, 0), min(cell[c, 0] + 2, rows)):
+            for column in range(max(cell[c, 1] - 1, 0), min(cell[c, 1] + 2, columns)):
+                other = own[row, column]
+                if other >= 0:
+                    summed[c] += moments[other]
+    return summed
+
+
+@njit(cache=True, nogil=True)
+def _line_pull(
+    nearest: NDArray[np.int32],
+    corner: FloatArray,
+    resolution: float,
+    normal: FloatArray,
+    offset: FloatArray,
+    pose: FloatArray,
+    points: FloatArray,
+    first: NDArray[np.int64],
+    sigma: float,
+    kernel: float,
+) -> tuple[FloatArray, FloatArray]:
+    rows, columns = nearest.shape
+    information = np.zeros((len(pose), 3, 3))
+    pull = np.zeros((len(pose), 3))
+    jacobian = np.empty(3)
+    for k in range(len(pose)):
+        cos, sin = np.cos(pose[k, 2]), np.sin(pose[k, 2])
+        for i in range(first[k], first[k + 1]):
+            turned_x = cos * points[i, 0] - sin * points[i, 1]
+            turned_y = sin * points[i, 0] + cos * points[i, 1]
+            x, y = pose[k, 0] + turned_x, pose[k, 1] + turned_y
+            column = int(np.floor((x - corner[0]) / resolution))
+            row = int(np.floor((y - corner[1]) / resolution))
+            if not (0 <= row < rows and 0 <= column < columns):
+                continue
+            line = nearest[row, column]
+            off = normal[line, 0] * x + normal[line, 1] * y - offset[line]
+            if (normal[line, 0] == 0.0 and normal[line, 1] == 0.0) or abs(off) > 3.0 * kernel:
+                continue
+            jacobian[0], jacobian[1] = normal[line, 0], normal[line, 1]
+            jacobian[2] = normal[line, 1] * turned_x - normal[line, 0] * turned_y
+            weight = np.exp(-0.5 * (off / kernel) ** 2) / (sigma * sigma)
+            for m in range(3):
+                pull[k, m] -= weight * jacobian[m] * off
+                for n in range(3):
+                    information[k, m, n] += weight * jacobian[m] * jacobian[n]
+    return information, pull
