@@ -127,6 +127,13 @@ def test_the_pictures_shown_are_there():
     assert all((TOP / file).is_file() for file in re.findall(r'src="([^"]+)"', README))
 
 
+def test_the_table_of_results_is_the_last_that_was_recorded():
+    heading = "| | paper | paper.toml | default |\n"
+    recorded = (TOP / "tests" / "benchmarks" / "RESULTS.md").read_text(encoding="utf-8")
+    shown, last = (text.split(heading)[1].split("\n\n")[0] for text in (README, recorded))
+    assert shown == last
+
+
 def test_the_checks_that_machines_run_are_those_that_the_readme_names():
     assert "\ntests/run\n" in README
     for script in (TOP / "tests" / "run", TOP / ".ci" / "run"):
