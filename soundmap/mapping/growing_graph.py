@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soundmap.geometry import FloatArray, composed, transformed, wrapped_angle
-from soundmap.mapping.alignment import PointStore, aligned_scan, pair_fits
-from soundmap.mapping.correlation import best_placement, nearness_grid
+from soundmap.mapping.alignment import Alignment, PointStore, aligned_scan, pair_fits
+from soundmap.mapping.correlation import NearnessGrid, best_placement, nearness_grid
 from soundmap.mapping.key_scans import KeyScan
 from soundmap.mapping.links import odometry_links, scan_links
 from soundmap.mapping.pose_graph import Links
@@ -31,8 +31,14 @@ LATEST = 4
 MOST_LINKS = 5
 LEAST_MATCHED_SHARE = 0.35
 LEAST_MATCHED = 15
-SEARCH_BEYOND_M, SEARCH_BEYOND_RAD = 0.15, 0.12
-"""If odometry may be off by more than this, the pose is searched for, not only refined."""
+LEAST_WINDOW = (0.2, np.radians(12.0))
+"""The pose is searched for at least this far around the expected one [m, rad] ..."""
+WIDE_WINDOW = (1.0, np.radians(45.0))
+"""... and so far if nothing is found there that fits well: odometry slips and stamps err."""
+WELL_MATCHED_SHARE = 0.6
+CLEARLY_BETTER = 0.15
+UNMATCHED_M = 4.0
+"""A scan that fits none of its neighbours is known as badly as after so much more way."""
 GATES_M = (0.3, 0.15)
 
 
@@ -56,6 +62,7 @@ class GrowingGraph:
         self.matched[0] = True
         self._odometry_links = odometry_links(scans, model)
         self._scan_links: list[Links] = []
+        self._trust = np.ones(max(len(scans) - 1, 0))
 
     @property
     def pose(self) -> FloatArray:
@@ -70,7 +77,8 @@ class GrowingGraph:
         """All links between the scans added."""
         odometry = self._odometry_links
         done = self.count - 1
-        chain = Links(odometry.pairs[:done], odometry.measured[:done], odometry.information[:done])
+        information = odometry.information[:done] * self._trust[:done, None, None]
+        chain = Links(odometry.pairs[:done], odometry.measured[:done], information)
         return Links.joined([chain, *self._scan_links])
 
     def adopt(self, model: OdometryModel) -> None:
@@ -96,6 +104,7 @@ class GrowingGraph:
         # coo_array adds up what is given twice; only the first of equal pairs may stay.
         _, once = np.unique(pairs[:, 0] * self.count + pairs[:, 1], return_index=True)
         length = 0.02 + np.hypot(gap[:, 0], gap[:, 1])
+        length[: self.count - 1] += UNMATCHED_M * ~self.matched[1 : self.count]
         graph = coo_array(
             (length[once], (pairs[once, 0], pairs[once, 1])), shape=(self.count, self.count)
         )
@@ -136,54 +145,69 @@ class GrowingGraph:
         """Lay the new scan on others; links to those it fits best, None if it fits none."""
         if len(targets) == 0:
             return None
-        index = np.append(targets, new)
-        store = PointStore.of([self.scans[k] for k in index])
-        pose = self._pose[index].copy()
-        pose[-1] = self._searched(new, targets, expected, prior_information)
-        found = aligned_scan(
-            store,
-            pose,
-            moving=len(targets),
-            prior=expected,
-            prior_information=prior_information,
-            gates_m=GATES_M,
-        )
+        store = PointStore.of([self.scans[k] for k in (*targets, new)])
+        pose = np.vstack([self._pose[targets], expected])
+        grid = nearness_grid(self.points_of(targets), expected[:2])
+        sigma = 1.0 / np.sqrt(np.diag(prior_information))
+        likely = np.maximum(LEAST_WINDOW, 3.0 * sigma[[0, 2]])
+        found = _fitted(store, pose, grid, likely, prior_information)
+        if found.matched < WELL_MATCHED_SHARE:
+            wide = np.maximum(WIDE_WINDOW, likely)
+            other = _fitted(store, pose, grid, wide, 0.01 * prior_information)
+            if other.matched > found.matched + CLEARLY_BETTER:
+                found = other
         if found.matched < LEAST_MATCHED_SHARE:
             return None
         pose[-1] = self._pose[new] = found.pose
-        others = np.arange(len(targets))
-        pairs = np.stack([np.full(len(targets), len(targets)), others], axis=-1)
+        self._trust[new - 1] = _trust(found.pose, expected, prior_information)
+        pairs = np.stack([np.full(len(targets), len(targets)), np.arange(len(targets))], axis=-1)
         fits = pair_fits(store, pose, pairs, gate_m=GATES_M[-1])
         links = scan_links(pose, pairs, fits, least_matched=LEAST_MATCHED)
         strength = np.linalg.det(links.information) ** (1.0 / 3.0)
         best = np.argsort(-strength, kind="stable")[:MOST_LINKS]
         if len(best) == 0:
             return None
+        index = np.append(targets, new)
         return Links(index[links.pairs[best]], links.measured[best], links.information[best])
-
-    def _searched(
-        self,
-        new: int,
-        targets: NDArray[np.int64],
-        expected: FloatArray,
-        prior_information: FloatArray,
-    ) -> FloatArray:
-        """Where to begin: the best pose within three standard deviations of the expected one."""
-        window_m = 3.0 / np.sqrt(prior_information[0, 0])
-        window_rad = 3.0 / np.sqrt(prior_information[2, 2])
-        if window_m < SEARCH_BEYOND_M and window_rad < SEARCH_BEYOND_RAD:
-            return expected
-        grid = nearness_grid(self.points_of(targets), expected[:2])
-        found = best_placement(
-            grid,
-            self.scans[new].end_m,
-            expected,
-            window_m=min(window_m, 2.0),
-            window_rad=min(window_rad, np.pi / 3),
-            least_score=0.2,
-        )
-        return expected if found is None else found.pose
 
     def points_of(self, index: NDArray[np.int64]) -> FloatArray:
         """Returns of some scans in the map frame, shape (P, 2) [m]."""
         return np.concatenate([transformed(self._pose[k], self.scans[k].end_m) for k in index])
+
+
+def _fitted(
+    store: PointStore,
+    pose: FloatArray,
+    grid: NearnessGrid,
+    window: FloatArray,
+    prior_information: FloatArray,
+) -> Alignment:
+    """The last of some scans searched for in a window [m, rad] and laid on the others."""
+    moving = len(pose) - 1
+    found = best_placement(
+        grid,
+        store.end_m[store.first[moving] :],
+        pose[moving],
+        window_m=float(window[0]),
+        window_rad=float(window[1]),
+        least_score=0.2,
+    )
+    start = pose.copy()
+    if found is not None:
+        start[moving] = found.pose
+    trust = _trust(start[moving], pose[moving], prior_information)
+    return aligned_scan(
+        store,
+        start,
+        moving=moving,
+        prior=pose[moving],
+        prior_information=trust * prior_information,
+        gates_m=GATES_M,
+    )
+
+
+def _trust(found: FloatArray, expected: FloatArray, information: FloatArray) -> float:
+    """Weight of an expectation that what was found contradicts (Cauchy)."""
+    off = found - expected
+    off[2] = wrapped_angle(off[2])
+    return float(1.0 / (1.0 + off @ information @ off / 9.0))

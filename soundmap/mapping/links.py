@@ -18,6 +18,8 @@ PAIR_SIGMA = np.array([0.01, 0.01, np.radians(0.2)])
 WEAKEST = 1.0
 """Information added where surfaces say nothing, so that a corridor stays loose but solvable."""
 MOST_STEP_M = 0.3
+SLIP_M_PER_RAD = 0.05
+"""A turn moves the base by so much unawares: wheels slip, and stamps are late [m/rad]."""
 
 
 def scan_links(
@@ -50,11 +52,12 @@ def odometry_links(scans: Sequence[KeyScan], model: OdometryModel, first: int = 
     odometry = np.array([scan.odometry for scan in scans])
     driven = np.array([scan.driven_m for scan in scans])
     turned = np.array([scan.turned_rad for scan in scans])
-    return Links(
-        pairs,
-        model.corrected(relative(odometry[index - 1], odometry[index])),
-        model.information(driven[index] - driven[index - 1], turned[index] - turned[index - 1]),
-    )
+    way, turn = driven[index] - driven[index - 1], turned[index] - turned[index - 1]
+    information = model.information(way, turn)
+    slip = 1.0 / (1.0 + information[:, 0, 0] * (SLIP_M_PER_RAD * turn) ** 2)
+    information[:, [0, 1], [0, 1]] *= slip[:, None]
+    step = model.corrected(relative(odometry[index - 1], odometry[index]))
+    return Links(pairs, step, information)
 
 
 def _limited(information: FloatArray) -> FloatArray:
