@@ -13,6 +13,7 @@ import numpy as np
 
 from soundmap.config import Config, DetectConfig, DiffConfig, ScanConfig
 from soundmap.detect.difference import changed_places, power_ratio
+from soundmap.detect.fitted_sources import fitted_sources
 from soundmap.detect.source_list import detect_sources
 from soundmap.errors import ConfigError, NothingUsableError, OutputError
 from soundmap.fuse.accumulate import PowerAccumulator
@@ -76,7 +77,7 @@ def process(
         accumulator = PowerAccumulator(power_map_frame(room, config.fuse.cell_m), reference)
         keeper = _Keeper()
         scans = keeper.kept(audio_scans(log.audio(), array, config.scan, losses=log.losses))
-        fused = 0
+        fused, around_m = 0, []
         for scan in fused_scans(
             _watched(scans, stage, start_ns),
             log.lasers(),
@@ -87,6 +88,7 @@ def process(
             losses=log.losses,
         ):
             fused += scan.point_m is not None
+            around_m.append(scan.around_m)
     if not len(keeper):
         raise NothingUsableError(
             f"{log_path}: the audio is too short or too broken for one audio scan of "
@@ -94,14 +96,19 @@ def process(
         )
     with clock.stage("detect"):
         power_map = accumulator.power_map()
-        sources = detect_sources(power_map, config.detect)
+        kept = keeper.audio_scans(reference, array.mount)
+        if config.detect.method == "sparse":
+            around = np.array(around_m)
+            sources = fitted_sources(kept, around, trajectory, array, config.scan, config.detect)
+        else:
+            sources = detect_sources(power_map, config.detect)
     return Run(
         log=log_path,
         fingerprint=log.fingerprint,
         config=config,
         room=room,
         trajectory=trajectory,
-        scans=keeper.audio_scans(reference, array.mount),
+        scans=kept,
         power_map=power_map,
         sources=sources,
         losses=tuple(log.losses),

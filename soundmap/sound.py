@@ -148,23 +148,71 @@ class PowerMap:
 
 
 @dataclass(frozen=True)
+class SourceFit:
+    """What the fit to all scans tells of a source beyond its place.
+
+    Attributes
+    ----------
+    power_1m : float
+        Mean square in the band at 1 m [linear].
+    covariance_m2 : ndarray, shape (2, 2)
+        Of x and y [m^2].
+    false_alarm_probability : float
+        That a run without any source would show as much anywhere.
+    arc_rad : float
+        Width of the arc of directions that it was heard from [rad].
+    flags : tuple of str
+        ``not_seen_by_laser``, ``seen_from_one_side``, ``unsteady``.
+    """
+
+    power_1m: float
+    covariance_m2: FloatArray
+    false_alarm_probability: float
+    arc_rad: float
+    flags: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class Source:
-    """A local maximum of the power map.
+    """Where sound comes from: a local maximum of the power map, or a source of the fit.
 
     Attributes
     ----------
     x_m, y_m : float
         Position in the map frame [m].
     power : float
-        :math:`P_{ij}` there [linear].
+        :math:`P_{ij}` there [linear]; of a fitted source, that at 1 m.
     visits : int
-        :math:`K_{ij}` there.
+        :math:`K_{ij}` there; of a fitted source, the audio scans that heard it.
+    fit : SourceFit or None
+        None if it is a mere maximum.
     """
 
     x_m: float
     y_m: float
     power: float
     visits: int
+    fit: SourceFit | None = None
+
+
+@dataclass(frozen=True)
+class Reflection:
+    """The mirror image of a source, behind the surface that reflects it.
+
+    Attributes
+    ----------
+    x_m, y_m : float
+        Position of the image in the map frame [m].
+    power : float
+        Mean square in the band at 1 m from the image [linear].
+    source : int or None
+        Index of the source that it belongs to; None if none fits.
+    """
+
+    x_m: float
+    y_m: float
+    power: float
+    source: int | None
 
 
 @dataclass(frozen=True)
@@ -176,10 +224,13 @@ class SourceList:
     sources : tuple of Source
     reference : LevelReference
         What their power refers to.
+    reflections : tuple of Reflection
+        Mirror images, loudest first; known only from a fit.
     """
 
     sources: tuple[Source, ...]
     reference: LevelReference
+    reflections: tuple[Reflection, ...] = ()
 
     def __iter__(self) -> Iterator[Source]:
         return iter(self.sources)

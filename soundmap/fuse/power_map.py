@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from soundmap.config import FuseConfig
 from soundmap.deskew import deskewed_rays
@@ -20,6 +21,8 @@ from soundmap.sensors import LaserScan
 from soundmap.sound import AudioScan, LevelReference
 
 STAGE = "fuse"
+DIRECTIONS = 360
+"""Directions around the array in which the surroundings of each scan are kept."""
 LASER_AGE_NS = 200_000_000
 """A laser scan farther from an audio scan than this no longer shows the same surroundings."""
 
@@ -38,12 +41,16 @@ class FusedScan:
         Where its strongest candidate lies in the map frame [m]; None if it added nothing.
     power : float
         :math:`C_m` [linear]; NaN if it added nothing.
+    around_m : ndarray of float32, shape (M,)
+        Range to the first surface all around, on the array's own bearings 2 pi m / M [m]; NaN
+        where unknown.
     """
 
     time_ns: int
     pose: FloatArray
     point_m: FloatArray | None
     power: float
+    around_m: NDArray[np.float32]
 
 
 def power_map_frame(room: OccupancyGrid, cell_m: float) -> GridFrame:
@@ -88,9 +95,11 @@ def fused_scans(
     FusedScan
     """
     nearest = _NearestScans(lasers)
+    directions = array_mount.base_bearing(2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS)
+    unknown = np.full(DIRECTIONS, np.nan, dtype=np.float32)
     for scan in scans:
         pose = trajectory.at(scan.time_ns)
-        nothing = FusedScan(scan.time_ns, pose, None, np.nan)
+        nothing = FusedScan(scan.time_ns, pose, None, np.nan, unknown)
         around = nearest.at(scan.time_ns)
         if not np.isfinite(pose).all():
             losses.remark(
@@ -108,7 +117,12 @@ def fused_scans(
             losses.add("audio scan without a laser scan at its time", STAGE, effect="not fused")
             yield nothing
             continue
-        candidate = _candidate(scan, pose, around, trajectory, array_mount, config)
+        rays = [deskewed_rays(laser, trajectory, scan.time_ns) for laser in around]
+        points = np.concatenate([swept.end_m for swept in rays]) - array_mount.translation_m[:2]
+        ranges = ranges_on_bearings(points, directions, tolerance_rad=np.pi / DIRECTIONS)
+        seen = ranges.astype(np.float32)
+        nothing = FusedScan(scan.time_ns, pose, None, np.nan, seen)
+        candidate = _candidate(scan, pose, points, array_mount, config)
         if candidate is None:
             losses.remark("audio scan without a surface in range", STAGE, effect="not fused")
             yield nothing
@@ -116,7 +130,7 @@ def fused_scans(
         point, power, distance = candidate
         spacing = 2.0 * np.pi / len(scan.bearing_rad)
         if accumulator.add(point, power, size_m=spacing * distance):
-            yield FusedScan(scan.time_ns, pose, point, power)
+            yield FusedScan(scan.time_ns, pose, point, power, seen)
         else:
             losses.remark("surface outside the map", STAGE, effect="not fused")
             yield nothing
@@ -132,8 +146,7 @@ def level_reference(pascal_per_count: float | None) -> LevelReference:
 def _candidate(
     scan: AudioScan,
     pose: FloatArray,
-    around: list[LaserScan],
-    trajectory: Trajectory,
+    points_m: FloatArray,
     array_mount: Mount,
     config: FuseConfig,
 ) -> tuple[FloatArray, float, float] | None:
@@ -144,9 +157,7 @@ def _candidate(
     if config.candidates == "peaks":
         bearing, received = scan.peaks()
     bearing = array_mount.base_bearing(bearing)
-    rays = [deskewed_rays(laser, trajectory, scan.time_ns) for laser in around]
-    points = np.concatenate([swept.end_m for swept in rays]) - centre
-    ranges = ranges_on_bearings(points, bearing, tolerance_rad=0.5 * spacing)
+    ranges = ranges_on_bearings(points_m, bearing, tolerance_rad=0.5 * spacing)
     emitted = emitted_power(
         received, ranges, alpha=config.alpha, d_min=config.d_min_m, d_max=config.d_max_m
     )

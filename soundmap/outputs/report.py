@@ -19,10 +19,15 @@ from soundmap import __version__
 from soundmap.config import DiffConfig
 from soundmap.geometry import Trajectory
 from soundmap.run import Run
-from soundmap.sound import Change, PowerRatio, SourceList, decibels
+from soundmap.sound import Change, PowerRatio, Source, SourceList, decibels
 
 SCHEMA_VERSION = 1
-SOURCE_COLUMNS = ("id", "x_m", "y_m", "power_db", "visits", "power_reference")
+SOURCE_COLUMNS = (
+    "id", "x_m", "y_m", "power_db", "visits", "power_reference",
+    "level_1m_db", "var_x_m2", "cov_xy_m2", "var_y_m2", "false_alarm_probability", "arc_deg",
+    "flags",
+)  # fmt: skip
+REFLECTION_COLUMNS = ("id", "x_m", "y_m", "level_1m_db", "source")
 CHANGE_COLUMNS = ("id", "x_m", "y_m", "ratio_db", "visits")
 LIBRARIES = ("numpy", "scipy", "numba", "matplotlib", "mcap", "rosbags", "pydantic", "rerun-sdk")
 
@@ -46,6 +51,7 @@ def run_report(run: Run, timings_s: Mapping[str, float]) -> dict[str, Any]:
         "speed": run.duration_s / spent if spent > 0 else None,
         "level_reference": str(run.sources.reference),
         "sources": source_rows(run.sources),
+        "reflections": reflection_rows(run.sources),
         "trajectory": trajectory_summary(run.trajectory),
         "counts": dict(run.counts),
         "losses": [dataclasses.asdict(loss) for loss in run.losses],
@@ -88,9 +94,41 @@ def source_rows(sources: SourceList) -> list[dict[str, Any]]:
             "power_db": _finite(round(float(decibels(source.power)), 3)),
             "visits": source.visits,
             "power_reference": str(sources.reference),
+            **_fit_row(source),
         }
         for number, source in enumerate(sources, start=1)
     ]
+
+
+def reflection_rows(sources: SourceList) -> list[dict[str, Any]]:
+    """One row a mirror image, with the id of the source that it belongs to, if one is known."""
+    return [
+        {
+            "id": f"R{number}",
+            "x_m": round(image.x_m, 4),
+            "y_m": round(image.y_m, 4),
+            "level_1m_db": _finite(round(float(decibels(image.power)), 3)),
+            "source": "" if image.source is None else f"S{image.source + 1}",
+        }
+        for number, image in enumerate(sources.reflections, start=1)
+    ]
+
+
+def _fit_row(source: Source) -> dict[str, Any]:
+    """What a fit tells of a source; empty for a mere maximum of the power map."""
+    fit = source.fit
+    if fit is None:
+        return {}
+    (var_x, cov_xy), (_, var_y) = fit.covariance_m2.tolist()
+    return {
+        "level_1m_db": _finite(round(float(decibels(fit.power_1m)), 3)),
+        "var_x_m2": round(var_x, 7),
+        "cov_xy_m2": round(cov_xy, 7),
+        "var_y_m2": round(var_y, 7),
+        "false_alarm_probability": float(f"{fit.false_alarm_probability:.3g}"),
+        "arc_deg": round(math.degrees(fit.arc_rad), 1),
+        "flags": " ".join(fit.flags),
+    }
 
 
 def change_rows(changes: Sequence[Change]) -> list[dict[str, Any]]:

@@ -22,6 +22,7 @@ from soundmap.outputs.picture_format import PictureFormat
 from soundmap.outputs.pictures import difference_pictures, run_pictures, write_pictures
 from soundmap.outputs.report import (
     CHANGE_COLUMNS,
+    REFLECTION_COLUMNS,
     SCHEMA_VERSION,
     SOURCE_COLUMNS,
     csv_text,
@@ -63,6 +64,8 @@ def write_run(
         (folder / "config.toml").write_text(config_toml(run.config), encoding="utf-8")
         shown = write_pictures(partial(run_pictures, run), folder, figures)
         report = run_report(run, {**run.timings_s, "outputs": time.perf_counter() - start})
+        images = csv_text(REFLECTION_COLUMNS, report["reflections"])
+        (folder / "reflections.csv").write_text(images, encoding="utf-8")
         _write_report(folder, SOURCE_COLUMNS, report, shown)
     return report
 

@@ -23,6 +23,7 @@ CONTENT = {
     "map.yaml",
     "power_map.npz",
     "power_map.png",
+    "reflections.csv",
     "report.html",
     "report.json",
     "sources.csv",

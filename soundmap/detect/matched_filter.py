@@ -1,0 +1,174 @@
+r"""Matched filter: how well a source at a place would explain what all scans have heard.
+
+A source of mean square q at 1 m adds to scan s, on bearing n,
+
+.. math:: q \, B(\theta_n, \phi_s) / (\max(r_s, 0.4\,\mathrm{m})^2 + h^2),
+
+if the lasers let it be seen from there: B is the beam, :math:`\phi_s` and :math:`r_s` bearing and
+distance of the source, h the height between it and the array.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from soundmap.detect.candidates import REACH_M, Kind
+from soundmap.detect.evidence import Evidence, Single
+from soundmap.geometry import FloatArray
+
+HEIGHT_M = 0.3
+"""Height between source and array that is assumed [m]."""
+NEAREST_M = 0.4
+ON_SURFACE_M, ON_SURFACE_PER_M = 0.22, 0.03
+"""What is on a surface lies within this distance of the laser hit on its bearing [m] [m/m]."""
+FARTHEST_BEHIND_M = 2.6
+IN_FRONT_M = 0.35
+"""What is in the open lies no more than this behind the laser hit on its bearing [m]."""
+LEAST_SCANS = 4.0
+"""A place that fewer scans (effective number) tell of is no candidate."""
+
+
+@njit(cache=True, nogil=True)
+def _gain(distance: float, surface: float, kind: int) -> float:
+    if kind != 2 and np.isnan(surface):
+        return 0.0
+    beyond = distance - surface
+    if kind == 0 and abs(beyond) > ON_SURFACE_M + ON_SURFACE_PER_M * distance:
+        return 0.0
+    if kind == 1 and (beyond > FARTHEST_BEHIND_M or beyond < 0.0):
+        return 0.0
+    if kind == 2 and beyond > IN_FRONT_M:
+        return 0.0
+    near = max(distance, NEAREST_M)
+    return 1.0 / (near * near + HEIGHT_M * HEIGHT_M)
+
+
+@njit(cache=True, nogil=True)
+def _explained(
+    places: FloatArray,
+    kinds: NDArray[np.int64],
+    stand: FloatArray,
+    axis: FloatArray,
+    hand: float,
+    ranges: Single,
+    weight: FloatArray,
+    matched: Single,
+    energy: FloatArray,
+) -> FloatArray:
+    waves = ranges.shape[1]
+    explained = np.zeros(len(places))
+    for c in range(len(places)):
+        match, square, fourth = 0.0, 0.0, 0.0
+        for s in range(len(stand)):
+            dx, dy = places[c, 0] - stand[s, 0], places[c, 1] - stand[s, 1]
+            square_m = dx * dx + dy * dy
+            if square_m > REACH_M * REACH_M:
+                continue
+            turn = hand * (np.arctan2(dy, dx) - axis[s]) / (2.0 * np.pi)
+            at = (turn - np.floor(turn)) * waves
+            left = int(at)
+            share = at - left
+            left %= waves
+            right = (left + 1) % waves
+            surface = ranges[s, left if share < 0.5 else right]
+            gain = weight[s] * _gain(np.sqrt(square_m), surface, kinds[c])
+            if gain > 0.0:
+                match += gain * ((1.0 - share) * matched[s, left] + share * matched[s, right])
+                part = gain * gain * energy[s]
+                square += part
+                fourth += part * part
+        if match > 0.0 and square * square > LEAST_SCANS * fourth:
+            explained[c] = match * match / square
+    return explained
+
+
+def matched_scans(evidence: Evidence, residual: Single, slope: int) -> Single:
+    """Product of each scan with the beam toward each direction, shape (S, M)."""
+    matched = np.empty((len(evidence), evidence.beams.shape[2]), dtype=np.float32)
+    for turn_class in np.unique(evidence.turn_class):
+        chosen = evidence.turn_class == turn_class
+        matched[chosen] = residual[chosen] @ evidence.beams[slope, turn_class].T
+    return matched
+
+
+def explained_energy(
+    evidence: Evidence,
+    matched: Single,
+    slope: int,
+    places_m: FloatArray,
+    kinds: NDArray[np.int64],
+) -> FloatArray:
+    """Energy of the residual that one source at each place would explain, shape (C,).
+
+    Parameters
+    ----------
+    evidence : Evidence
+    matched : ndarray, shape (S, M)
+        Of `matched_scans`.
+    slope : int
+        Index of the beams.
+    places_m : ndarray, shape (C, 2)
+    kinds : ndarray of int, shape (C,)
+        `Kind` of each place.
+    """
+    energy = (evidence.beams[slope, :, 0].astype(np.float64) ** 2).sum(axis=1)
+    return np.asarray(
+        _explained(
+            np.ascontiguousarray(places_m, dtype=np.float64),
+            np.ascontiguousarray(kinds, dtype=np.int64),
+            evidence.place_m,
+            evidence.axis_rad,
+            float(evidence.handedness),
+            evidence.range_m,
+            evidence.weight,
+            matched,
+            energy[evidence.turn_class],
+        )
+    )
+
+
+def seen_from(
+    evidence: Evidence, place_m: FloatArray, kind: Kind
+) -> tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]:
+    """The scans that hear a place.
+
+    Returns
+    -------
+    scans : ndarray of int, shape (V,)
+    wave : ndarray, shape (V,)
+        Bearing of the place in steps of the beams' directions.
+    gain : ndarray, shape (V,)
+        Received for emitted power, 1 at 1 m.
+    beyond_m : ndarray, shape (V,)
+        How far behind the first surface on its bearing it lies [m].
+    """
+    step = place_m - evidence.place_m
+    distance = np.hypot(step[:, 0], step[:, 1])
+    waves = evidence.range_m.shape[1]
+    turn = evidence.handedness * (np.arctan2(step[:, 1], step[:, 0]) - evidence.axis_rad)
+    wave = (turn / (2.0 * np.pi)) % 1.0 * waves
+    nearest = np.rint(wave).astype(np.int64) % waves
+    surface = evidence.range_m[np.arange(len(evidence)), nearest].astype(np.float64)
+    gain = np.array(
+        [
+            _gain(d, s, int(kind)) if d < REACH_M else 0.0
+            for d, s in zip(distance, surface, strict=True)
+        ]
+    )
+    scans = np.flatnonzero(gain > 0.0)
+    return scans, wave[scans], gain[scans], (distance - surface)[scans]
+
+
+def column(
+    evidence: Evidence, scans: NDArray[np.int64], wave: FloatArray, gain: FloatArray, slope: int
+) -> Single:
+    """What a source of power 1 at 1 m adds to the scans that hear it, shape (V, N)."""
+    waves = evidence.beams.shape[2]
+    left = wave.astype(np.int64) % waves
+    share = (wave - np.floor(wave)).astype(np.float32)[:, None]
+    turn = evidence.turn_class[scans]
+    beams = evidence.beams[slope]
+    beam = (1.0 - share) * beams[turn, left] + share * beams[turn, (left + 1) % waves]
+    return np.asarray((evidence.weight[scans] * gain).astype(np.float32)[:, None] * beam)

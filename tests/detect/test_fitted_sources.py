@@ -1,0 +1,99 @@
+"""Scans made by a sum over sources and images in a rectangular room, with exact laser ranges."""
+
+import numpy as np
+import pytest
+
+from soundmap.config import DetectConfig, ScanConfig
+from soundmap.detect.fitted_sources import fitted_sources
+from soundmap.geometry import Mount, Trajectory
+from soundmap.sensors import MicArray
+from soundmap.sound import AudioScans, LevelReference
+
+WIDTH, DEPTH = 6.0, 5.0
+ANGLE = 2.0 * np.pi * np.arange(16) / 16
+POSITIONS = np.stack([0.155 * np.cos(ANGLE), 0.155 * np.sin(ANGLE), 0.0 * ANGLE], axis=-1)
+MOUNT = Mount.planar(0.1, 0.0, 0.5, 0.3)
+
+
+def way():
+    """Half a lap through the room, 20 s at 0.3 m/s, with a turn in the middle."""
+    time_s = np.arange(0.0, 20.0, 0.05)
+    along = 0.3 * time_s
+    x = np.where(along < 3.0, 1.5 + along, 4.5)
+    y = np.where(along < 3.0, 1.5, 1.5 + np.minimum(along - 3.0, 2.0))
+    heading = np.clip((along - 2.7) / 0.6, 0.0, 1.0) * 0.5 * np.pi
+    time_ns = (1_700_000_000 * 10**9 + time_s * 1e9).astype(np.int64)
+    pose = np.column_stack([x, y, heading])
+    return Trajectory(time_ns, pose, np.ones(len(pose), dtype=bool))
+
+
+def response(toward):
+    """Power of the beamformer's output on 120 bearings for waves from ``toward``, white sound."""
+    looking = 2.0 * np.pi * np.arange(120) / 120
+    total = np.zeros(120)
+    for hertz in np.linspace(1000.0, 6000.0, 40):
+        k = 2.0 * np.pi * hertz / 343.0
+        wave = np.exp(
+            1j * k * (np.cos(toward) * POSITIONS[:, 0] + np.sin(toward) * POSITIONS[:, 1])
+        )
+        steer = np.exp(1j * k * (np.outer(np.cos(looking), POSITIONS[:, 0])
+                                 + np.outer(np.sin(looking), POSITIONS[:, 1])))  # fmt: skip
+        total += np.abs(steer.conj() @ wave / 16) ** 2
+    return total / 40
+
+
+def run(emitters, *, ambient=1.0, seed=1):
+    """Audio scans and laser ranges of the way; emitters are x, y and power at 1 m."""
+    rng = np.random.default_rng(seed)
+    track = way()
+    time_ns = track.time_ns[2:-2:2]
+    power, ranges = [], []
+    for pose in track.at(time_ns):
+        turn = pose[2] + MOUNT.yaw_rad
+        place = pose[:2] + 0.1 * np.array([np.cos(pose[2]), np.sin(pose[2])])
+        heard = np.full(120, ambient)
+        for x, y, strength in emitters:
+            step = np.array([x, y]) - place
+            heard += strength / (step @ step) * response(np.arctan2(step[1], step[0]) - turn)
+        power.append(heard * (1.0 + 0.02 * rng.standard_normal(120)))
+        ray = 2.0 * np.pi * np.arange(360) / 360 + turn
+        with np.errstate(divide="ignore"):
+            to_x = np.where(np.cos(ray) > 0, WIDTH - place[0], -place[0]) / np.cos(ray)
+            to_y = np.where(np.sin(ray) > 0, DEPTH - place[1], -place[1]) / np.sin(ray)
+        ranges.append(np.minimum(to_x, to_y))
+    bearing = 2.0 * np.pi * np.arange(120) / 120
+    scans = AudioScans(time_ns, bearing, np.array(power, np.float32), LevelReference.FULL_SCALE)
+    array = MicArray(POSITIONS, MOUNT, None)
+    around = np.array(ranges, np.float32)
+    return fitted_sources(scans, around, track, array, ScanConfig(), DetectConfig())
+
+
+@pytest.fixture(scope="module")
+def reflected():
+    """Two sources 10 dB apart, the louder with its mirror image in the wall x = 6."""
+    return run([(5.7, 3.0, 50.0), (6.3, 3.0, 15.0), (2.5, 0.0, 5.0)])
+
+
+def test_a_weak_source_is_found_beside_a_strong_one_and_its_image(reflected):
+    places = [(source.x_m, source.y_m) for source in reflected]
+    assert len(places) == 2
+    np.testing.assert_allclose(places[1], (2.5, 0.0), atol=0.08)
+
+
+def test_a_source_on_a_wall_is_found_where_it_is_with_its_level():
+    (source,) = run([(6.0, 3.1, 20.0)])
+    np.testing.assert_allclose((source.x_m, source.y_m), (6.0, 3.1), atol=0.05)
+    assert 10.0 * np.log10(source.power / 20.0) == pytest.approx(0.0, abs=1.0)
+    assert source.fit is not None
+    assert source.fit.false_alarm_probability < 1e-6
+
+
+def test_an_image_behind_a_wall_is_told_from_the_source_in_front_of_another():
+    found = run([(0.0, 2.5, 30.0), (12.0 - 4.6, 4.9, 8.0)])
+    assert len(found) == 1
+    assert len(found.reflections) >= 1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_silent_run_has_no_source(seed):
+    assert len(run([], seed=seed)) == 0
