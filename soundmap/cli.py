@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import signal
 import sys
 from collections import Counter
@@ -22,6 +21,8 @@ from soundmap.terminal import (
     ForceOption,
     JsonOption,
     QuietOption,
+    StartPoseOption,
+    parsed_start_pose,
     print_result,
     resolved_config,
     show_error,
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 EPILOG = """\b
 Examples:
   soundmap info run1.mcap
-  soundmap process run1.mcap --map map.yaml
+  soundmap process run1.mcap
   soundmap process run1.mcap run3.mcap --map map.yaml --config robot.toml
   soundmap diff run1 run3
   soundmap view run1
@@ -116,7 +117,7 @@ def process(
             "--map",
             metavar="MAP.yaml",
             help="Geometric map of the site: a map_server YAML file, which names its image. "
-            "Needed for now.",
+            "Default: it is built from the log, with its origin at the robot's first pose.",
         ),
     ] = None,
     config: ConfigOption = None,
@@ -128,14 +129,7 @@ def process(
             "Default: a folder here with the name of the log.",
         ),
     ] = None,
-    start_pose: Annotated[
-        str | None,
-        typer.Option(
-            metavar="X,Y,DEG",
-            help="Where in the map the robot starts: x and y in metres, heading in degrees "
-            "counter-clockwise from the x axis. Default: it is searched for in the whole map.",
-        ),
-    ] = None,
+    start_pose: StartPoseOption = None,
     figures: FiguresOption = PictureFormat.PNG,
     *,
     rerun: Annotated[
@@ -160,12 +154,12 @@ def process(
 
     Writes a folder a log: sources, power map, trajectory, pictures, report.
     """
-    if map_file is None:
+    start = parsed_start_pose(start_pose)
+    if map_file is None and start is not None:
         raise typer.BadParameter(
-            "a geometric map is needed for now: --map MAP.yaml, a map_server map of the site",
-            param_hint="'--map'",
+            "a start pose is one in a given map: add --map MAP.yaml, or leave --start-pose out",
+            param_hint="'--start-pose'",
         )
-    start = _parsed_start_pose(start_pose)
     folders = _run_folders(logs, out)
     settings = resolved_config(config)
     outcomes = []
@@ -193,6 +187,7 @@ def process(
 
 
 app.command("map")(cli_map.map_log)
+app.command("localize")(cli_map.localize_log)
 app.command()(cli_runs.diff)
 app.command()(cli_runs.evaluate)
 app.command()(cli_runs.view)
@@ -251,7 +246,7 @@ def _stop(number: int, _frame: object) -> None:
 def _processed(
     log: Path,
     folder: Path,
-    map_file: Path,
+    map_file: Path | None,
     config: Config,
     *,
     start: tuple[float, float, float] | None,
@@ -293,23 +288,6 @@ def _run_folders(logs: list[Path], out: Path | None) -> list[Path]:
             param_hint="'LOG...'",
         )
     return folders
-
-
-def _parsed_start_pose(text: str | None) -> tuple[float, float, float] | None:
-    """X,Y,DEG as metres and radians."""
-    if text is None:
-        return None
-    try:
-        x, y, degrees = (float(part) for part in text.split(","))
-    except ValueError:
-        x = y = degrees = math.nan
-    if not all(math.isfinite(number) for number in (x, y, degrees)):
-        raise typer.BadParameter(
-            f"{text!r} is no start pose: give x and y in metres and the heading in degrees, "
-            "separated by commas, as in --start-pose 1.2,-0.5,90",
-            param_hint="'--start-pose'",
-        )
-    return x, y, math.radians(degrees)
 
 
 def _show_runs(outcomes: list[dict[str, Any]], *, quiet: bool, as_json: bool) -> None:

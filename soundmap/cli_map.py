@@ -1,4 +1,4 @@
-"""The command that builds the geometric map."""
+"""The commands that need no audio: build a map, localize in one."""
 
 from __future__ import annotations
 
@@ -14,16 +14,21 @@ from soundmap.terminal import (
     ForceOption,
     JsonOption,
     QuietOption,
+    StartPoseOption,
+    parsed_start_pose,
     print_result,
     resolved_config,
 )
 
+LogArgument = Annotated[
+    Path, typer.Argument(metavar="LOG", help="Recorded log: an .mcap file or a rosbag2 folder.")
+]
+OutOption = Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")]
+
 
 def map_log(
-    log: Annotated[
-        Path, typer.Argument(metavar="LOG", help="Recorded log: an .mcap file or a rosbag2 folder.")
-    ],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")],
+    log: LogArgument,
+    out: OutOption,
     config: ConfigOption = None,
     figures: FiguresOption = PictureFormat.PNG,
     *,
@@ -49,3 +54,42 @@ def map_log(
         report = write_map_run(run, new, figures=figures)
     if not quiet or as_json:
         print_result({**report, "folder": str(out)}, map_view, as_json=as_json)
+
+
+def localize_log(
+    log: LogArgument,
+    map_file: Annotated[
+        Path,
+        typer.Option(
+            "--map",
+            metavar="MAP.yaml",
+            help="Geometric map of the site: a map_server YAML file, which names its image.",
+        ),
+    ],
+    out: OutOption,
+    start_pose: StartPoseOption = None,
+    config: ConfigOption = None,
+    figures: FiguresOption = PictureFormat.PNG,
+    *,
+    force: ForceOption = False,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Find the trajectory of a log in a map. Needs no audio.
+
+    Writes a folder with the trajectory, the map, a picture of both and a report.
+    """
+    from soundmap.outputs.map_folder import write_map_run
+    from soundmap.outputs.new_folder import new_folder
+    from soundmap.outputs.progress import chosen_progress
+    from soundmap.outputs.summary import localization_view
+
+    settings, start = resolved_config(config), parsed_start_pose(start_pose)
+    with new_folder(out, force=force, inputs=[log, map_file]) as new:
+        from soundmap.map_log import localized
+
+        progress = chosen_progress(quiet=quiet or as_json)
+        run = localized(log, map_file, settings, start_pose=start, progress=progress)
+        report = write_map_run(run, new, figures=figures)
+    if not quiet or as_json:
+        print_result({**report, "folder": str(out)}, localization_view, as_json=as_json)

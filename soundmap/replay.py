@@ -18,11 +18,12 @@ from soundmap.detect.source_list import detect_sources
 from soundmap.errors import ConfigError, NothingUsableError, OutputError
 from soundmap.fuse.accumulate import PowerAccumulator
 from soundmap.fuse.power_map import fused_scans, level_reference, power_map_frame
-from soundmap.geometry import Mount
+from soundmap.geometry import Mount, Trajectory
 from soundmap.grid import OccupancyGrid
 from soundmap.localize.trajectory import estimate_trajectory
 from soundmap.logs.robot_log import RobotLog, open_log
 from soundmap.map_file import read_map
+from soundmap.mapping.geometric_map import build_map
 from soundmap.outputs.progress import Progress, Stage
 from soundmap.outputs.stored_run import read_power_map
 from soundmap.run import Run
@@ -33,23 +34,24 @@ from soundmap.sound import AudioScan, AudioScans, LevelReference, PowerRatio
 
 def process(
     log_path: Path,
-    map_path: Path,
+    map_path: Path | None,
     config: Config,
     *,
     start_pose: tuple[float, float, float] | None = None,
     progress: Progress,
 ) -> Run:
-    """Sources, power map and trajectory of one log in a given geometric map.
+    """Sources, power map and trajectory of one log.
 
     Parameters
     ----------
     log_path : Path
         An MCAP file or a rosbag2 folder.
-    map_path : Path
-        map_server's YAML file.
+    map_path : Path or None
+        map_server's YAML file of the geometric map; without it, the map is built from the log, and
+        its origin is the first pose.
     config : Config
     start_pose : tuple of float, optional
-        x [m], y [m], heading [rad] in the map; without it, it is found in the map.
+        x [m], y [m], heading [rad] in the given map; without it, it is found in the map.
     progress : Progress
 
     Raises
@@ -57,7 +59,7 @@ def process(
     SoundmapError
         The log, the map or the configuration does not do.
     """
-    room = read_map(map_path)
+    room = None if map_path is None else read_map(map_path)
     clock = _Stopwatch(progress)
     with clock.stage("read"):
         log = open_log(log_path, config)
@@ -67,11 +69,7 @@ def process(
     _check_band(log, config.scan)
     start_ns, duration_s = int(log.odometry.time_ns[0]), log.duration_s
 
-    with clock.stage("localize", duration_s) as stage:
-        lasers = _watched(log.lasers(), stage, start_ns)
-        trajectory = estimate_trajectory(
-            lasers, log.odometry, room, config.localize, start_pose=start_pose, losses=log.losses
-        )
+    room, trajectory = _placed(log, room, config, start_pose, clock)
     with clock.stage("scan and fuse", duration_s) as stage:
         reference = level_reference(array.pascal_per_count)
         accumulator = PowerAccumulator(power_map_frame(room, config.fuse.cell_m), reference)
@@ -169,6 +167,28 @@ def compared(run: Path, background: Path, diff: DiffConfig, detect: DetectConfig
         min_ratio_db=diff.min_ratio_db,
     )
     return Comparison(ratio, read_map(run / "map.yaml"), run, background)
+
+
+def _placed(
+    log: RobotLog,
+    room: OccupancyGrid | None,
+    config: Config,
+    start_pose: tuple[float, float, float] | None,
+    clock: _Stopwatch,
+) -> tuple[OccupancyGrid, Trajectory]:
+    """The geometric map and the trajectory in it; both from the log if no map is given."""
+    if room is None:
+        with clock.stage("map", 1.0) as stage:
+            built = build_map(
+                log.lasers, log.odometry, config.map, losses=log.losses, report=stage.advance_to
+            )
+        return built.room, built.trajectory
+    with clock.stage("localize", log.duration_s) as stage:
+        lasers = _watched(log.lasers(), stage, int(log.odometry.time_ns[0]))
+        trajectory = estimate_trajectory(
+            lasers, log.odometry, room, config.localize, start_pose=start_pose, losses=log.losses
+        )
+    return room, trajectory
 
 
 def _check_band(log: RobotLog, scan: ScanConfig) -> None:

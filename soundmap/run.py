@@ -60,7 +60,7 @@ class Run:
 
 @dataclass(frozen=True)
 class MapRun:
-    """The results of ``soundmap map`` for one log.
+    """The results of ``soundmap map`` or ``soundmap localize`` for one log.
 
     Attributes
     ----------
@@ -71,11 +71,12 @@ class MapRun:
     config : Config
         As resolved.
     room : OccupancyGrid
-        The geometric map built (Sect. 2.1), with its origin at the first pose.
+        The geometric map (Sect. 2.1): built, with its origin at the first pose, or given.
     trajectory : Trajectory
         Base frame in the map frame.
     facts : dict
-        How the map came about: loops, residuals, errors of the odometry, by name.
+        How the map came about: loops, residuals, errors of the odometry, by name; empty for a map
+        that was given.
     losses : tuple of Loss
         What had to be left out.
     counts : dict

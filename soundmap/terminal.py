@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -51,6 +52,16 @@ JsonOption = Annotated[
 ]
 
 
+StartPoseOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="X,Y,DEG",
+        help="Where in the map the robot starts: x and y in metres, heading in degrees "
+        "counter-clockwise from the x axis. Default: it is searched for in the whole map.",
+    ),
+]
+
+
 def resolved_config(files: list[Path] | None) -> Config:
     """The settings of the files given, over the defaults."""
     from soundmap.config import loaded_config
@@ -86,3 +97,20 @@ def show_error(error: SoundmapError) -> None:
 
     panel = Panel(Text(str(error)), title="soundmap: error", border_style="red")
     Console(stderr=True).print(panel)
+
+
+def parsed_start_pose(text: str | None) -> tuple[float, float, float] | None:
+    """X,Y,DEG as metres and radians."""
+    if text is None:
+        return None
+    try:
+        x, y, degrees = (float(part) for part in text.split(","))
+    except ValueError:
+        x = y = degrees = math.nan
+    if not all(math.isfinite(number) for number in (x, y, degrees)):
+        raise typer.BadParameter(
+            f"{text!r} is no start pose: give x and y in metres and the heading in degrees, "
+            "separated by commas, as in --start-pose 1.2,-0.5,90",
+            param_hint="'--start-pose'",
+        )
+    return x, y, math.radians(degrees)

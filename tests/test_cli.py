@@ -186,10 +186,15 @@ def test_an_earlier_run_is_refused_before_the_work_and_replaced_with_force(proce
     assert not Path("run1/note").exists()
 
 
-def test_without_a_map_the_usage_is_explained(processed):
-    result = invoked("process", "run1.mcap")
+def test_without_a_map_the_pipeline_is_asked_to_build_one(processed):
+    assert invoked("process", "run1.mcap").exit_code == 0
+    assert processed[0]["map"] is None
+
+
+def test_a_start_pose_without_a_map_is_a_usage_error(processed):
+    result = invoked("process", "run1.mcap", "--start-pose", "1,2,90")
     assert result.exit_code == 2
-    assert "--map MAP.yaml, a map_server map of the site" in " ".join(result.stderr.split())
+    assert "add --map MAP.yaml" in " ".join(result.stderr.split())
     assert processed == []
 
 
@@ -414,7 +419,8 @@ def test_a_reader_that_goes_away_is_no_traceback():
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_stops_the_work_and_leaves_nothing_behind(tmp_path, number, code):
     program = (
-        "import time, soundmap.replay\n"
+        "import signal, time, soundmap.replay\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job ignores it\n"
         "def process(*args, **keywords): print('working', flush=True); time.sleep(60)\n"
         "soundmap.replay.process = process\n"
         "from soundmap.cli import main\n"

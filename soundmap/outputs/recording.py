@@ -153,7 +153,7 @@ class RunRecording:
     def _draw_uncertainty(self) -> None:
         """The ellipse that holds the robot's place with two standard deviations."""
         trajectory = self._run.trajectory
-        covariance: FloatArray | None = getattr(trajectory, "covariance", None)
+        covariance = trajectory.covariance
         if covariance is None:
             return
         values, axes = np.linalg.eigh(covariance[:, :2, :2])

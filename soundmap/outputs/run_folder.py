@@ -182,7 +182,7 @@ def _audio_scan_arrays(scans: AudioScans) -> dict[str, ArrayLike]:
 def _trajectory_arrays(trajectory: Trajectory) -> dict[str, ArrayLike]:
     """What the TUM format cannot say, too: which poses may be trusted, and how far."""
     known: dict[str, ArrayLike] = {}
-    covariance: FloatArray | None = getattr(trajectory, "covariance", None)
+    covariance = trajectory.covariance
     if covariance is not None:
         known["covariance"] = covariance
     return {

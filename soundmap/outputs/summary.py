@@ -61,6 +61,26 @@ def diff_view(report: Mapping[str, Any]) -> RenderableType:
     )
 
 
+def localization_view(report: Mapping[str, Any]) -> RenderableType:
+    """Trajectory, losses, time and files of a log that was localized in a map."""
+    spent_s = sum(report["timings_s"].values())
+    speed = f", {report['speed']:.3g} x real time" if report["speed"] else ""
+    way = report["trajectory"]
+    return Group(
+        Text(f"{report['log']}: {report['duration_s']:.1f} s of log in {spent_s:.1f} s{speed}"),
+        _lines(
+            {
+                "Trajectory": f"{way['length_m']:.2f} m, {way['poses']} poses, "
+                f"{100 * way['usable_share']:.1f} % usable",
+                "Used": ", ".join(f"{count} {_words(name)}" for name, count in _counts(report)),
+                "Time": _times(report["timings_s"]),
+                "Files": f"{report['folder']}/",
+            }
+        ),
+        *_losses(report["losses"]),
+    )
+
+
 def map_view(report: Mapping[str, Any]) -> RenderableType:
     """Map, odometry, losses, time and files of a map that was built."""
     spent_s = sum(report["timings_s"].values())

@@ -170,8 +170,6 @@ def test_the_polar_curve_points_at_the_loudest_bearing_in_the_robots_frame(recor
 
 
 def test_the_uncertainty_is_an_ellipse_of_two_standard_deviations(recorded, run):
-    if not hasattr(run.trajectory, "covariance"):
-        pytest.skip("poses come without a covariance")
     ellipse = np.array(recorded.values("/world/run/pose_uncertainty", "strips")[7][0])[:, :2]
     reach = np.abs(ellipse - run.trajectory.pose[7, :2]).max(axis=0)
     assert reach == pytest.approx([0.4, 0.2], rel=1e-3)
