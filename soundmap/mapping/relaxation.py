@@ -41,7 +41,8 @@ def overlapping_pairs(pose: FloatArray, neighbours: int) -> NDArray[np.int64]:
     tree = cKDTree(pose[:, :2])
     pairs = set()
     for k, near in enumerate(tree.query_ball_point(pose[:, :2], REACH_M)):
-        others = np.array([other for other in near if other != k], dtype=np.int64)
+        others = np.array(near, dtype=np.int64)
+        others = others[others != k]
         gap = np.hypot(*(pose[others, :2] - pose[k, :2]).T)
         turn = np.abs(wrapped_angle(pose[others, 2] - pose[k, 2]))
         alike = others[np.argsort(gap + TURN_M_PER_RAD * turn, kind="stable")]
@@ -94,6 +95,7 @@ def relaxed_poses(
         kept = PairFits(fits.information[overlap], fits.gradient[overlap], fits.matched[overlap])
         surfaces = scan_links(pose, both[overlap], kept, least_matched=LEAST_MATCHED)
         links = Links.joined([odometry, surfaces])
-        pose = solved_graph(pose, links, most_iterations=4, robust_scale=ROBUST_SCALE).pose
+        # The pairs are fitted anew after every step: more steps with the old fits gain nothing.
+        pose = solved_graph(pose, links, most_iterations=1, robust_scale=ROBUST_SCALE).pose
         report(number + 1)
     return pose, links
