@@ -95,3 +95,23 @@ def test_scans_with_hardly_a_return_are_counted(drive):
     found = chosen_key_scans([blind, *scans[1:5]], truth, **options, losses=losses)
     assert [loss.what for loss in losses] == ["laser scan with too few returns"]
     assert {scan.scanner for scan in found.scans} == {0, 1}
+
+
+def test_odometry_that_stands_still_while_the_robot_drives_is_an_error(drive):
+    truth, scans = drive
+    stuck = replace(truth, pose=np.zeros_like(truth.pose))
+    with pytest.raises(NothingUsableError, match="never moves"):
+        drives.keys(scans, stuck)
+
+
+def test_a_robot_at_rest_with_people_about_is_no_error():
+    truth = worlds.driven([(1, 1), (1.001, 1)])
+    scans = worlds.laser_scans(truth, [worlds.FRONT], rate_hz=20)
+
+    def with_passer_by(scan, number):
+        ranges = scan.range_m.copy()
+        ranges[20 * number : 20 * number + 60] = 0.7
+        return replace(scan, range_m=ranges)
+
+    seen = [with_passer_by(scan, number) for number, scan in enumerate(scans)]
+    assert len(drives.keys(seen, truth).scans) == 1
