@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import signal
 import sys
 from collections import Counter
@@ -234,6 +235,10 @@ def simulate(
 
 def main() -> None:
     """Entry point of the ``soundmap`` command."""
+    # Small products gain nothing from threads of the linear algebra, and on a busy machine lose
+    # several-fold to their waiting for one another. Read when numpy is first imported.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     signal.signal(signal.SIGTERM, _stop)
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it tells of its font cache otherwise
     app(prog_name="soundmap")
