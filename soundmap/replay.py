@@ -97,7 +97,9 @@ def process(
         kept = keeper.audio_scans(reference, array.mount)
         if config.detect.method == "sparse":
             around = np.array(around_m)
-            sources = fitted_sources(kept, around, trajectory, array, config.scan, config.detect)
+            sources = fitted_sources(
+                kept, around, trajectory, array, config.scan, config.detect, room=room
+            )
         else:
             sources = detect_sources(power_map, config.detect)
     return Run(

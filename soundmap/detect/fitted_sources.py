@@ -28,6 +28,7 @@ from soundmap.detect.evidence import Evidence, Single, gathered_evidence
 from soundmap.detect.matched_filter import explained_energy, matched_scans
 from soundmap.detect.sparse_fit import Component, SparseFit, fitted_components
 from soundmap.geometry import FloatArray, Trajectory
+from soundmap.grid import OccupancyGrid
 from soundmap.sensors import MicArray
 from soundmap.sound import AudioScans, Reflection, Source, SourceFit, SourceList
 
@@ -46,9 +47,18 @@ AROUND_M = 0.3
 OPEN_STEP_M = 0.05
 INDEPENDENT_SHARE = 0.03
 """Independent measurements among the scans' bearings, as a share of their number."""
-PLACE_SIGMA_M = 0.012
+PLACE_SIGMA_M = 0.022
 """Standard deviation of a place that is due to cells, ranges and poses [m]."""
+BEFORE_WALL_SIGMA_M = 0.12
+"""Standard deviation toward the robot where only a wall is seen: the source may hang before it."""
+WALL_M = 0.10
+"""A surface nearer than this to an occupied cell of the map is a wall; others are machines."""
+LEAVE_SURFACE_M, LEAVE_SURFACE_RATIO, LEAVE_SURFACE_SHARE = 0.10, 1.03, 0.0065
+"""A source leaves the surface for a place in the open this far from it that explains so much more
+than the surface does: a ratio, and a share of what the whole fit leaves unexplained."""
+LEAVE_SURFACE_AROUND_M = 0.6
 IMAGE_TOLERANCE_M = 0.35
+JUST_BEHIND_M, ALONE_M = 0.4, 1.0
 ONE_SIDE_RAD = np.radians(40.0)
 UNSTEADY_SHARE = 0.35
 
@@ -60,6 +70,8 @@ def fitted_sources(
     array: MicArray,
     scan: ScanConfig,
     detect: DetectConfig,
+    *,
+    room: OccupancyGrid | None = None,
 ) -> SourceList:
     """Sources and mirror images, loudest first.
 
@@ -72,6 +84,8 @@ def fitted_sources(
     array : MicArray
     scan : ScanConfig
     detect : DetectConfig
+    room : OccupancyGrid, optional
+        The geometric map: a surface that it does not show is a machine, not a wall.
 
     Returns
     -------
@@ -88,6 +102,7 @@ def fitted_sources(
     fit = fitted_components(evidence, candidates, least_share=GROWTH_SHARE, most=MOST_COMPONENTS)
     if not fit.components:
         return none
+    _bring_to_surface(fit)
     location, scale = chance_distribution(fit)
     energies = [fit.energy_without(index) - fit.energy for index in range(len(fit.components))]
     probabilities = [float(-np.expm1(-np.exp(-(e - location) / scale))) for e in energies]
@@ -98,8 +113,36 @@ def fitted_sources(
         and energies[index] >= LEAST_SHARE[fit.components[index].kind] * fit.energy
     ]
     chosen.sort(key=lambda index: -fit.strength[index])
-    sources = tuple(_source(fit, index, probabilities[index]) for index in chosen)
+    for index in chosen:
+        _leave_surface(fit, index)
+    sources = tuple(_source(fit, index, probabilities[index], room) for index in chosen)
     return SourceList(sources, scans.reference, _reflections(fit, probabilities, sources, detect))
+
+
+def _bring_to_surface(fit: SparseFit) -> None:
+    """Put what lies just behind a surface, with no other sound near it, onto the surface.
+
+    Reflections in the wall behind a source pull it outward; a mirror image proper has its source
+    as far in front of the surface as it lies behind.
+    """
+    surface = fit.candidates.surface_m
+    for index, component in enumerate(fit.components):
+        if component.kind != Kind.BEHIND or np.median(component.beyond_m) > JUST_BEHIND_M:
+            continue
+        others = [
+            np.hypot(*(other.place_m - component.place_m))
+            for other in fit.components
+            if other.kind != Kind.BEHIND
+        ]
+        away = np.hypot(*(surface - component.place_m).T)
+        near = surface[away < LEAVE_SURFACE_AROUND_M]
+        if min(others, default=np.inf) < ALONE_M or not len(near):
+            continue
+        matched = matched_scans(fit.evidence, fit.with_own(index), component.slope)
+        kinds = np.full(len(near), int(Kind.SURFACE), dtype=np.int64)
+        explained = explained_energy(fit.evidence, matched, component.slope, near, kinds)
+        place = near[int(np.argmax(explained))]
+        fit.replace(index, Component.at(fit.evidence, place, Kind.SURFACE, component.slope))
 
 
 def chance_distribution(fit: SparseFit) -> tuple[float, float]:
@@ -132,9 +175,40 @@ def _strongest_apart(components: Sequence[Component], energies: Sequence[float])
     return kept
 
 
-def _source(fit: SparseFit, index: int, probability: float) -> Source:
+def _leave_surface(fit: SparseFit, index: int) -> None:
+    """Move a component into the open if all scans clearly say that it is not on the surface."""
+    component, evidence = fit.components[index], fit.evidence
+    if component.kind != Kind.SURFACE:
+        return
+    steps = np.arange(-LEAVE_SURFACE_AROUND_M, LEAVE_SURFACE_AROUND_M + 1e-9, OPEN_STEP_M)
+    grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) + component.place_m
+    surface = fit.candidates.surface_m
+    near = np.hypot(*(surface - component.place_m).T) < LEAVE_SURFACE_AROUND_M
+    places = np.concatenate([grid, surface[near]])
+    kinds = np.full(len(places), int(Kind.OPEN), dtype=np.int64)
+    kinds[len(grid) :] = int(Kind.SURFACE)
+    matched = matched_scans(evidence, fit.with_own(index), component.slope)
+    explained = explained_energy(evidence, matched, component.slope, places, kinds)
+    in_open, on_surface = explained[: len(grid)], explained[len(grid) :]
+    best = int(np.argmax(in_open))
+    gain = in_open[best] - on_surface.max(initial=0.0)
+    nearest = places[len(grid) + int(np.argmax(on_surface))]
+    if (
+        gain > LEAVE_SURFACE_SHARE * fit.energy
+        and in_open[best] > LEAVE_SURFACE_RATIO * on_surface.max(initial=0.0)
+        and np.hypot(*(grid[best] - nearest)) > LEAVE_SURFACE_M
+    ):
+        fit.replace(index, Component.at(evidence, grid[best], Kind.OPEN, component.slope))
+
+
+def _source(fit: SparseFit, index: int, probability: float, room: OccupancyGrid | None) -> Source:
     component = fit.components[index]
     place, covariance = located(fit, index)
+    if component.kind == Kind.SURFACE and _on_wall(room, place):
+        toward = _direction_heard(fit, index, place)
+        covariance = covariance + BEFORE_WALL_SIGMA_M**2 * np.outer(toward, toward)
+    elif component.kind == Kind.OPEN:
+        covariance = covariance + (0.5 * BEFORE_WALL_SIGMA_M) ** 2 * np.eye(2)
     power = float(fit.strength[index])
     arc = _arc(fit.evidence, component.scans, place)
     flags = []
@@ -173,6 +247,26 @@ def located(fit: SparseFit, index: int) -> tuple[FloatArray, FloatArray]:
     mean = weight @ places
     spread = (places - mean).T @ ((places - mean) * weight[:, None])
     return mean, spread + PLACE_SIGMA_M**2 * np.eye(2)
+
+
+def _on_wall(room: OccupancyGrid | None, place_m: FloatArray) -> bool:
+    """Whether the map shows a surface there; also if there is no map to tell."""
+    if room is None:
+        return True
+    cell = room.frame.cells(place_m)
+    if not room.frame.contains(cell):
+        return True
+    clearance = float(room.clearance_cells[tuple(cell)]) * room.frame.resolution_m
+    return clearance < WALL_M
+
+
+def _direction_heard(fit: SparseFit, index: int, place_m: FloatArray) -> FloatArray:
+    """Unit vector from a place to where it was heard best, on average."""
+    component = fit.components[index]
+    step = fit.evidence.place_m[component.scans] - place_m
+    weight = np.einsum("sn,sn->s", component.column, component.column).astype(np.float64)
+    mean = weight @ (step / np.maximum(np.hypot(*step.T), 1e-6)[:, None])
+    return np.asarray(mean / max(float(np.hypot(*mean)), 1e-12))
 
 
 def _arc(evidence: Evidence, scans: NDArray[np.int64], place_m: FloatArray) -> float:

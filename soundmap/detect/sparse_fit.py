@@ -123,6 +123,12 @@ class SparseFit:
         self._data = np.delete(self._data, index, axis=1)
         self._fit_strengths()
 
+    def replace(self, index: int, component: Component) -> None:
+        """Another component in the place of one, and all strengths anew."""
+        self.components[index] = component
+        self._renew(index)
+        self._fit_strengths()
+
     def best_candidate(self, residual: Single | None = None) -> tuple[float, Component]:
         """The candidate that explains most of a residual, and how much energy that is."""
         residual = self.residual if residual is None else residual
