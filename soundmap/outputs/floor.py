@@ -183,7 +183,7 @@ class FloorPlan:
         size = (self.area.width * self.scale * 72.0, self.area.height * self.scale * 72.0)
         offsets = label_offsets(points, names, size, marker=CIRCLE_POINTS)
         some = any(offset is None for offset in offsets)
-        self._mark(places_m, "o", "black", "local maxima (some unlabelled)" if some else "")
+        self._mark(places_m, "o", "black", "found here (some unlabelled)" if some else "")
         for place, name, offset in zip(places_m, names, offsets, strict=True):
             if offset is not None:
                 text = self.axes.annotate(
@@ -279,7 +279,7 @@ class FloorPlan:
             markeredgecolor=colour,
             markeredgewidth=1.4,
             path_effects=_halo(),
-            label=label or "local maxima",
+            label=label or "found here",
             zorder=5,
         )
 

@@ -32,7 +32,7 @@ def drawn_values(figure: Figure) -> np.ma.MaskedArray:
 
 def test_the_trajectory_shows_its_ends_its_lost_part_and_the_sources():
     figure = trajectory_figure(made_run())
-    assert legend(figure) == ["trajectory", "not to be trusted", "start", "end", "local maxima"]
+    assert legend(figure) == ["trajectory", "not to be trusted", "start", "end", "found here"]
     assert {"S1", "S2"} <= texts(figure)
     start, end = (line for line in figure.axes[0].lines if line.get_label() in ("start", "end"))
     assert start.get_xydata()[0].tolist() == made_run().trajectory.pose[0, :2].tolist()
