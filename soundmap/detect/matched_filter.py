@@ -11,7 +11,7 @@ distance of the source, h the height between it and the array.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+from numba import njit, prange
 from numpy.typing import NDArray
 
 from soundmap.detect.candidates import REACH_M, Kind
@@ -45,7 +45,6 @@ def _gain(distance: float, surface: float, kind: int) -> float:
     return 1.0 / (near * near + HEIGHT_M * HEIGHT_M)
 
 
-@njit(cache=True, nogil=True)
 def _explained(
     places: FloatArray,
     kinds: NDArray[np.int64],
@@ -59,7 +58,7 @@ def _explained(
 ) -> FloatArray:
     waves = ranges.shape[1]
     explained = np.zeros(len(places))
-    for c in range(len(places)):
+    for c in prange(len(places)):
         match, square, fourth = 0.0, 0.0, 0.0
         for s in range(len(stand)):
             dx, dy = places[c, 0] - stand[s, 0], places[c, 1] - stand[s, 1]
@@ -82,6 +81,12 @@ def _explained(
         if match > 0.0 and square * square > LEAST_SCANS * fourth:
             explained[c] = match * match / square
     return explained
+
+
+_explained_by_few = njit(cache=True, nogil=True)(_explained)
+_explained_by_many = njit(cache=True, nogil=True, parallel=True)(_explained)
+MANY = 1000
+"""Places from which on the work is shared among cores; for fewer the sharing costs more."""
 
 
 def matched_scans(evidence: Evidence, residual: Single, slope: int) -> Single:
@@ -114,8 +119,9 @@ def explained_energy(
         `Kind` of each place.
     """
     energy = (evidence.beams[slope, :, 0].astype(np.float64) ** 2).sum(axis=1)
+    explained = _explained_by_many if len(places_m) >= MANY else _explained_by_few
     return np.asarray(
-        _explained(
+        explained(
             np.ascontiguousarray(places_m, dtype=np.float64),
             np.ascontiguousarray(kinds, dtype=np.int64),
             evidence.place_m,
