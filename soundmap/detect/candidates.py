@@ -15,7 +15,7 @@ HIT_CELL_M = 0.04
 """Laser hits within such a cell are one point of a surface."""
 LEAST_HITS = 3
 SURFACE_STEP_M = 0.10
-OPEN_STEP_M = 0.20
+OPEN_STEP_M = 0.25
 SURROUNDINGS_M = 2.2
 """How far from surfaces candidates lie: mirror images of what stands 1 m off a wall are 2 m off."""
 REACH_M = 9.0

@@ -17,6 +17,7 @@ source far above the lasers' plane is heard from one side only.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -25,7 +26,7 @@ from numpy.typing import NDArray
 from soundmap.config import DetectConfig, ScanConfig
 from soundmap.detect.candidates import Kind, candidate_places
 from soundmap.detect.evidence import Evidence, Single, gathered_evidence
-from soundmap.detect.matched_filter import explained_energy, matched_scans
+from soundmap.detect.matched_filter import explained_energy, heard_enough
 from soundmap.detect.sparse_fit import Component, SparseFit, fitted_components
 from soundmap.geometry import FloatArray, Trajectory
 from soundmap.grid import OccupancyGrid
@@ -38,8 +39,11 @@ GROWTH_SHARE = 0.012
 MOST_COMPONENTS = 24
 CHANCE_RUNS = 20
 CHANCE_SEED = 8
-LEAST_SHARE = {Kind.SURFACE: 0.05, Kind.OPEN: 0.12}
+LEAST_SHARE = {Kind.SURFACE: 0.04, Kind.OPEN: 0.12}
 """Least energy of a source over what the whole fit leaves unexplained."""
+MOST_EXCESS = 1.35
+"""What a source explains with strengths that vary along the way, over what its mean strength
+alone accounts for. More is sound that does not fade with distance as that of a source does."""
 ONE_SOURCE_M = 0.5
 """Components nearer to each other than this are one source."""
 AROUND_M = 0.3
@@ -97,8 +101,12 @@ def fitted_sources(
     if len(evidence) < LEAST_SCANS:
         return none
     candidates = candidate_places(evidence)
-    if not len(candidates.place_m):
+    heard = heard_enough(evidence, candidates.place_m, candidates.kind)
+    if not heard.any():
         return none
+    candidates = dataclasses.replace(
+        candidates, place_m=candidates.place_m[heard], kind=candidates.kind[heard]
+    )
     fit = fitted_components(evidence, candidates, least_share=GROWTH_SHARE, most=MOST_COMPONENTS)
     if not fit.components:
         return none
@@ -111,6 +119,7 @@ def fitted_sources(
         for index in _strongest_apart(fit.components, energies)
         if probabilities[index] <= detect.false_alarm_rate
         and energies[index] >= LEAST_SHARE[fit.components[index].kind] * fit.energy
+        and energies[index] <= MOST_EXCESS * fit.energy_at_mean_strength(index)
     ]
     chosen.sort(key=lambda index: -fit.strength[index])
     for index in chosen:
@@ -138,9 +147,9 @@ def _bring_to_surface(fit: SparseFit) -> None:
         near = surface[away < LEAVE_SURFACE_AROUND_M]
         if min(others, default=np.inf) < ALONE_M or not len(near):
             continue
-        matched = matched_scans(fit.evidence, fit.with_own(index), component.slope)
+        residual = fit.with_own(index)
         kinds = np.full(len(near), int(Kind.SURFACE), dtype=np.int64)
-        explained = explained_energy(fit.evidence, matched, component.slope, near, kinds)
+        explained = explained_energy(fit.evidence, residual, [component.slope], near, kinds)[0]
         place = near[int(np.argmax(explained))]
         fit.replace(index, Component.at(fit.evidence, place, Kind.SURFACE, component.slope))
 
@@ -187,8 +196,8 @@ def _leave_surface(fit: SparseFit, index: int) -> None:
     places = np.concatenate([grid, surface[near]])
     kinds = np.full(len(places), int(Kind.OPEN), dtype=np.int64)
     kinds[len(grid) :] = int(Kind.SURFACE)
-    matched = matched_scans(evidence, fit.with_own(index), component.slope)
-    explained = explained_energy(evidence, matched, component.slope, places, kinds)
+    residual = fit.with_own(index)
+    explained = explained_energy(evidence, residual, [component.slope], places, kinds)[0]
     in_open, on_surface = explained[: len(grid)], explained[len(grid) :]
     best = int(np.argmax(in_open))
     gain = in_open[best] - on_surface.max(initial=0.0)
@@ -239,8 +248,8 @@ def located(fit: SparseFit, index: int) -> tuple[FloatArray, FloatArray]:
         grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
         places = component.place_m + grid
     kinds = np.full(len(places), int(component.kind), dtype=np.int64)
-    matched = matched_scans(evidence, fit.with_own(index), component.slope)
-    explained = explained_energy(evidence, matched, component.slope, places, kinds)
+    residual = fit.with_own(index)
+    explained = explained_energy(evidence, residual, [component.slope], places, kinds)[0]
     noise = fit.energy / (INDEPENDENT_SHARE * fit.residual.size)
     weight = np.exp((explained - explained.max(initial=0.0)) / (2.0 * noise))
     weight /= weight.sum()

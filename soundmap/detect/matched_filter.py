@@ -10,6 +10,8 @@ distance of the source, h the height between it and the array.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
@@ -45,6 +47,34 @@ def _gain(distance: float, surface: float, kind: int) -> float:
     return 1.0 / (near * near + HEIGHT_M * HEIGHT_M)
 
 
+@njit(cache=True, nogil=True)
+def _gains(distance: FloatArray, surface: FloatArray, kind: int) -> FloatArray:
+    gain = np.zeros(len(distance))
+    for s in range(len(distance)):
+        if distance[s] < REACH_M:
+            gain[s] = _gain(distance[s], surface[s], kind)
+    return gain
+
+
+@njit(cache=True, nogil=True)
+def fast_arctan2(y: float, x: float) -> float:
+    """arctan2 to within 2e-5 rad, by the polynomial of Abramowitz and Stegun 4.4.49."""
+    if x == 0.0 and y == 0.0:
+        return 0.0
+    steep = abs(y) > abs(x)
+    z = x / y if steep else y / x
+    q = z * z
+    series = 0.0208351 * q - 0.0851330
+    series = (series * q + 0.1801410) * q - 0.3302995
+    angle = z * (series * q + 0.9998660)
+    if steep:
+        angle = (0.5 * np.pi if z >= 0.0 else -0.5 * np.pi) - angle
+        return angle if (y > 0.0) == (angle > 0.0) else angle + (np.pi if y > 0.0 else -np.pi)
+    if x < 0.0:
+        angle += np.pi if y >= 0.0 else -np.pi
+    return angle
+
+
 def _explained(
     places: FloatArray,
     kinds: NDArray[np.int64],
@@ -56,16 +86,16 @@ def _explained(
     matched: Single,
     energy: FloatArray,
 ) -> FloatArray:
-    waves = ranges.shape[1]
-    explained = np.zeros(len(places))
+    slopes, waves = len(matched), ranges.shape[1]
+    explained = np.zeros((slopes, len(places)))
     for c in prange(len(places)):
-        match, square, fourth = 0.0, 0.0, 0.0
+        match, square, fourth = np.zeros(slopes), np.zeros(slopes), np.zeros(slopes)
         for s in range(len(stand)):
             dx, dy = places[c, 0] - stand[s, 0], places[c, 1] - stand[s, 1]
             square_m = dx * dx + dy * dy
             if square_m > REACH_M * REACH_M:
                 continue
-            turn = hand * (np.arctan2(dy, dx) - axis[s]) / (2.0 * np.pi)
+            turn = hand * (fast_arctan2(dy, dx) - axis[s]) / (2.0 * np.pi)
             at = (turn - np.floor(turn)) * waves
             left = int(at)
             share = at - left
@@ -74,12 +104,15 @@ def _explained(
             surface = ranges[s, left if share < 0.5 else right]
             gain = weight[s] * _gain(np.sqrt(square_m), surface, kinds[c])
             if gain > 0.0:
-                match += gain * ((1.0 - share) * matched[s, left] + share * matched[s, right])
-                part = gain * gain * energy[s]
-                square += part
-                fourth += part * part
-        if match > 0.0 and square * square > LEAST_SCANS * fourth:
-            explained[c] = match * match / square
+                for k in range(slopes):
+                    between = (1.0 - share) * matched[k, s, left] + share * matched[k, s, right]
+                    match[k] += gain * between
+                    part = gain * gain * energy[k, s]
+                    square[k] += part
+                    fourth[k] += part * part
+        for k in range(slopes):
+            if match[k] > 0.0 and square[k] * square[k] > LEAST_SCANS * fourth[k]:
+                explained[k, c] = match[k] * match[k] / square[k]
     return explained
 
 
@@ -100,25 +133,43 @@ def matched_scans(evidence: Evidence, residual: Single, slope: int) -> Single:
 
 def explained_energy(
     evidence: Evidence,
-    matched: Single,
-    slope: int,
+    residual: Single,
+    slopes: Sequence[int],
     places_m: FloatArray,
     kinds: NDArray[np.int64],
 ) -> FloatArray:
-    """Energy of the residual that one source at each place would explain, shape (C,).
+    """Energy of the residual that one source at each place would explain, shape (slopes, C).
 
     Parameters
     ----------
     evidence : Evidence
-    matched : ndarray, shape (S, M)
-        Of `matched_scans`.
-    slope : int
-        Index of the beams.
+    residual : ndarray, shape (S, N)
+    slopes : sequence of int
+        Indices of the beams.
     places_m : ndarray, shape (C, 2)
     kinds : ndarray of int, shape (C,)
         `Kind` of each place.
     """
-    energy = (evidence.beams[slope, :, 0].astype(np.float64) ** 2).sum(axis=1)
+    matched = np.stack([matched_scans(evidence, residual, slope) for slope in slopes])
+    return _explained_by(evidence, matched, slopes, places_m, kinds)
+
+
+def heard_enough(
+    evidence: Evidence, places_m: FloatArray, kinds: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    """Whether enough scans could tell of a source at each place, shape (C,)."""
+    everything = np.ones((1, *evidence.range_m.shape), dtype=np.float32)
+    return np.asarray(_explained_by(evidence, everything, [0], places_m, kinds)[0] > 0.0)
+
+
+def _explained_by(
+    evidence: Evidence,
+    matched: Single,
+    slopes: Sequence[int],
+    places_m: FloatArray,
+    kinds: NDArray[np.int64],
+) -> FloatArray:
+    energy = (evidence.beams[list(slopes), :, 0].astype(np.float64) ** 2).sum(axis=2)
     explained = _explained_by_many if len(places_m) >= MANY else _explained_by_few
     return np.asarray(
         explained(
@@ -130,7 +181,7 @@ def explained_energy(
             evidence.range_m,
             evidence.weight,
             matched,
-            energy[evidence.turn_class],
+            np.ascontiguousarray(energy[:, evidence.turn_class]),
         )
     )
 
@@ -157,12 +208,7 @@ def seen_from(
     wave = (turn / (2.0 * np.pi)) % 1.0 * waves
     nearest = np.rint(wave).astype(np.int64) % waves
     surface = evidence.range_m[np.arange(len(evidence)), nearest].astype(np.float64)
-    gain = np.array(
-        [
-            _gain(d, s, int(kind)) if d < REACH_M else 0.0
-            for d, s in zip(distance, surface, strict=True)
-        ]
-    )
+    gain = _gains(distance, surface, int(kind))
     scans = np.flatnonzero(gain > 0.0)
     return scans, wave[scans], gain[scans], (distance - surface)[scans]
 

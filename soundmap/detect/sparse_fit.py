@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from soundmap.detect.candidates import Candidates, Kind
 from soundmap.detect.evidence import SLOPES_DB_PER_OCTAVE, Evidence, Single
-from soundmap.detect.matched_filter import column, explained_energy, matched_scans, seen_from
+from soundmap.detect.matched_filter import column, explained_energy, seen_from
 from soundmap.geometry import FloatArray
 
 STRETCH = 8
@@ -143,6 +143,10 @@ class SparseFit:
             self._renew(index)
         self._fit_strengths()
 
+    def energy_at_mean_strength(self, index: int) -> float:
+        """Energy of what a component adds to the scans at its mean strength."""
+        return float(self.strength[index] ** 2 * self._gram[:, index, index].sum())
+
     def energy_without(self, index: int) -> float:
         """What would be left unexplained if a component were not there."""
         kept = [i for i in range(len(self.components)) if i != index]
@@ -168,19 +172,15 @@ class SparseFit:
     def _best(
         self, residual: Single, slopes: tuple[int, ...], count: int
     ) -> tuple[float, int, int]:
-        best = (-1.0, 0, slopes[0])
-        for slope in slopes:
-            value = self._factor[:count] * explained_energy(
-                self.evidence,
-                matched_scans(self.evidence, residual, slope),
-                slope,
-                self.candidates.place_m[:count],
-                self.candidates.kind[:count],
-            )
-            index = int(np.argmax(value))
-            if value[index] > best[0]:
-                best = (float(value[index]), index, slope)
-        return best
+        value = self._factor[:count] * explained_energy(
+            self.evidence,
+            residual,
+            slopes,
+            self.candidates.place_m[:count],
+            self.candidates.kind[:count],
+        )
+        best, index = np.unravel_index(int(np.argmax(value)), value.shape)
+        return float(value[best, index]), int(index), slopes[int(best)]
 
     def _improve(self, index: int, radius_m: float) -> None:
         component = self.components[index]
@@ -194,18 +194,15 @@ class SparseFit:
             around = place + np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
         places = np.concatenate([around, place[None]])
         kinds = np.full(len(places), int(kind), dtype=np.int64)
-        best = (-1.0, place, 0)
-        for slope in range(len(SLOPES_DB_PER_OCTAVE)):
-            matched = matched_scans(self.evidence, residual, slope)
-            value = explained_energy(self.evidence, matched, slope, places, kinds)
-            top = int(np.argmax(value))
-            if value[top] > best[0]:
-                best = (float(value[top]), places[top], slope)
-        if kind != Kind.SURFACE:
-            value_there, there, slope = self._best(residual, FIRST_SLOPES, self._surfaces)
+        slopes = tuple(range(len(SLOPES_DB_PER_OCTAVE)))
+        value = explained_energy(self.evidence, residual, slopes, places, kinds)
+        slope, top = np.unravel_index(int(np.argmax(value)), value.shape)
+        best = (float(value[slope, top]), places[top], int(slope))
+        if kind != Kind.SURFACE and self._surfaces:
+            value_there, there, its_slope = self._best(residual, FIRST_SLOPES, self._surfaces)
             if value_there >= BACK_TO_SURFACE[kind] * best[0]:
                 kind = Kind.SURFACE
-                best = (value_there, self.candidates.place_m[there], slope)
+                best = (value_there, self.candidates.place_m[there], its_slope)
         self.components[index] = Component.at(self.evidence, best[1], kind, best[2])
 
     def _renew(self, index: int) -> None:

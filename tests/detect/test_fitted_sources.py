@@ -70,8 +70,8 @@ def run(emitters, *, ambient=1.0, seed=1):
 
 @pytest.fixture(scope="module")
 def reflected():
-    """Two sources 10 dB apart, the louder with its mirror image in the wall x = 6."""
-    return run([(5.7, 3.0, 50.0), (6.3, 3.0, 15.0), (2.5, 0.0, 5.0)])
+    """Two sources 10 dB apart, the louder with its mirror image in the wall y = 5."""
+    return run([(6.0, 3.0, 50.0), (6.0, 7.0, 15.0), (2.5, 0.0, 5.0)])
 
 
 def test_a_weak_source_is_found_beside_a_strong_one_and_its_image(reflected):
