@@ -28,11 +28,11 @@ import scipy
 from soundmap.config import ArrayConfig, ScanConfig
 from soundmap.geometry import Mount
 from soundmap.scan.audio_scan import audio_scans
-from soundmap.scan.peak import refined_peak
 from soundmap.scan.response import steered_response_power_direct
 from soundmap.scan.spectrum import Framing, band_bins, hann_power
 from soundmap.scan.steering import scan_bearings, steering_vectors
 from soundmap.sensors import AudioBlock, MicArray
+from soundmap.sound import AudioScan
 
 RATE_HZ = 48000.0
 CONFIG = ScanConfig()
@@ -157,9 +157,10 @@ def main() -> None:
         difference = np.abs(power - truth[: len(power)]).max() / truth.max()
         print(f"| {name} | {per_second:.5f} | {1.0 / per_second:.1f} ", end="")
         print(f"| {per_second / baseline:.2f} | {difference:.1e} |")
-    peak = refined_peak(truth.mean(axis=0), scan_bearings(CONFIG.bearings))
-    error = abs(np.degrees(peak.bearing_rad) - SOURCES[0][0])
-    print(f"\nstronger source at {np.degrees(peak.bearing_rad):.2f} deg, {error:.2f} deg off")
+    mean = AudioScan(0, scan_bearings(CONFIG.bearings), truth.mean(axis=0))
+    loudest = np.degrees(mean.peaks()[0][0])
+    error = abs(loudest - SOURCES[0][0])
+    print(f"\nstronger source at {loudest:.2f} deg, {error:.2f} deg off")
     sys.exit(0 if error < 0.3 else 1)
 
 

@@ -23,10 +23,10 @@ from plane_waves import (
 from soundmap.config import ScanConfig
 from soundmap.losses import LossLedger
 from soundmap.scan.audio_scan import audio_scans
-from soundmap.scan.peak import refined_peak
 from soundmap.scan.response import steered_response_power_direct
 from soundmap.scan.spectrum import Framing
 from soundmap.sensors import AudioBlock
+from soundmap.sound import AudioScan
 
 RATE = 48000.0
 PAPER = ScanConfig()
@@ -66,9 +66,9 @@ def test_a_plane_wave_is_found_where_it_comes_from_and_as_loud_as_it_is(rate_hz,
         scans = scans_of(samples, positions, rate_hz, full_scale=full_scale)
         assert len(scans) == 2
         for scan in scans:
-            peak = refined_peak(scan.power, scan.bearing_rad)
-            assert np.degrees(angle_between(peak.bearing_rad, bearing)) < 0.3
-            assert abs(decibels_between(peak.power, (rms / full_scale) ** 2)) < 0.1
+            found, power = (values[0] for values in scan.peaks())
+            assert np.degrees(angle_between(found, bearing)) < 0.3
+            assert abs(decibels_between(power, (rms / full_scale) ** 2)) < 0.1
 
 
 def test_power_on_a_bearing_of_the_scan_is_the_mean_square_of_its_plane_wave():
@@ -323,9 +323,9 @@ def test_a_change_of_rate_or_full_scale_starts_anew():
     scans = list(audio_scans(parts, array, PAPER))
     assert [scan.time_ns - START_NS for scan in scans] == [57_489_583, 257_468_750]
     for scan in scans:
-        peak = refined_peak(scan.power, scan.bearing_rad)
-        assert np.degrees(angle_between(peak.bearing_rad, 2.0)) < 0.3
-        assert abs(decibels_between(peak.power, 0.01)) < 0.1
+        found, power = (values[0] for values in scan.peaks())
+        assert np.degrees(angle_between(found, 2.0)) < 0.3
+        assert abs(decibels_between(power, 0.01)) < 0.1
     parts = two_parts(first, 8.0 * first, gap_ns=0, continues=True, full_scale=(1.0, 8.0))
     once, again = audio_scans(parts, array, PAPER)
     assert np.allclose(once.power, again.power, rtol=1e-5, atol=0)
@@ -370,5 +370,5 @@ def test_a_talker_recorded_with_a_real_array_is_found_within_one_degree():
     for file in files:
         samples, rate_hz = soundfile.read(file, dtype="int16", always_2d=True)
         scans = scans_of(samples, positions, float(rate_hz), full_scale=32768.0)
-        peak = refined_peak(mean_power(scans), scans[0].bearing_rad)
-        assert np.degrees(angle_between(peak.bearing_rad, np.pi)) < 1.0, file
+        mean = AudioScan(0, scans[0].bearing_rad, mean_power(scans))
+        assert np.degrees(angle_between(mean.peaks()[0][0], np.pi)) < 1.0, file
