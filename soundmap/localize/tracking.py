@@ -122,7 +122,9 @@ class Tracker:
         usable = particle_filter.concentrated(estimate) and self._believed(
             view, estimate.pose, agreement
         )
-        return Fix(view, estimate.pose, agreement, usable)
+        # Only smoothing looks at the rays again; an hour of them would fill 100 MB.
+        kept = view if self._config.smoothing else view.without_rays()
+        return Fix(kept, estimate.pose, agreement, usable)
 
     def _believed(self, view: View, pose: FloatArray, agreement: Agreement) -> bool:
         """Whether the scan speaks for the pose, the more so the less is known of the run."""

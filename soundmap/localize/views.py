@@ -8,7 +8,7 @@ whole scan, and later only shows that the pose still holds.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -58,6 +58,11 @@ class View:
     def time_ns(self) -> int:
         """Time of the view [ns since epoch]."""
         return self.rays.time_ns
+
+    def without_rays(self) -> View:
+        """The same view with nothing seen."""
+        nothing = np.empty((0, 2))
+        return replace(self, rays=Rays(self.time_ns, nothing, nothing))
 
 
 @dataclass(frozen=True)
