@@ -154,22 +154,6 @@ class AudioPacket(NamedTuple):
     data: Any
 
 
-def frames_in(packet: AudioPacket, encoding: AudioEncoding, width: int) -> int:
-    """How many samples of every channel a packet holds.
-
-    Raises
-    ------
-    MessageError
-        The bytes do not divide into the channels, or are not as many as declared.
-    """
-    frame_bytes = encoding.channels * width
-    frames, rest = divmod(len(packet.data), frame_bytes)
-    declared = packet.declared_frames
-    if rest or not frames or (declared is not None and declared not in (frames, 0)):
-        raise MessageError("audio block is not as long as its header says")
-    return frames
-
-
 def block_samples(data: Any, encoding: AudioEncoding, sample: SampleFormat) -> NDArray[Any]:
     """Samples of a packet, shape (frames, channels), native byte order."""
     values = sample.decoded(np.frombuffer(data, dtype=np.uint8))
