@@ -50,7 +50,8 @@ def valid_ranges(sweep: LaserSweep) -> FloatArray:
 
     No return is what a scanner reports as NaN, infinite, nought, or outside its own limits.
     """
-    ranges = np.array(sweep.ranges, dtype=np.float64)
+    with np.errstate(invalid="ignore"):  # what a signalling NaN raises when it is widened
+        ranges = np.array(sweep.ranges, dtype=np.float64)
     low = max(sweep.range_min_m, 0.0) if np.isfinite(sweep.range_min_m) else 0.0
     high = sweep.range_max_m if np.isfinite(sweep.range_max_m) else np.inf
     if not high > low:

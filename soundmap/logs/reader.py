@@ -17,27 +17,29 @@ from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel as ChannelRecord
-from mcap.records import ChunkIndex, Footer, Schema
+from mcap.records import Schema
 
 from soundmap.errors import LogError
 from soundmap.logs.chunk import MAX_CHUNK_BYTES, chunk_content
+from soundmap.logs.file_summary import (
+    MAGIC,
+    RECORD_DAMAGE,
+    RECORD_HEAD,
+    FileSummary,
+    file_summary,
+)
+from soundmap.logs.resync import next_record
 from soundmap.losses import LossLedger
 
-MAGIC = b"\x89MCAP0\r\n"
 BATCH_BYTES = 2**20
 """Messages outside chunks are put in order in batches of this size."""
 
 LAST_TIME_NS = 2**62
 """The year 2116; what was logged later was not."""
 
-_RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
-_DAMAGE = (
-    McapError, ValueError, struct.error, OSError, KeyError, RuntimeError, MemoryError, EOFError,
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -133,10 +135,10 @@ class McapLog:
             yield from _in_order(_FileWalk(self, number, file, wanted).batches())
         self._surveyed = True
 
-    def count(self, what: str, where: str, effect: str) -> None:
+    def count(self, what: str, where: str, effect: str, *, count: int = 1) -> None:
         """Count damage, unless an earlier pass has."""
         if not self._surveyed:
-            self.losses.add(what, where, effect=effect)
+            self.losses.add(what, where, effect=effect, count=count)
 
     def chunk_topics(self, place: tuple[int, int]) -> frozenset[Channel] | None:
         """Channels in the chunk at (file, offset); empty if damaged, None if not seen yet."""
@@ -156,21 +158,26 @@ class _FileWalk:
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self.selected: dict[int, Channel | None] = {}
-        self.summary = _Summary()
+        self.summary = FileSummary()
+        self.chunked = False
+        self.last_ns = 0
+        self.messages = 0
 
     def batches(self) -> Iterator[list[Message]]:
         """Messages chunk by chunk, each list in the order of log time."""
         with self.file.open("rb", buffering=2**18) as stream:
-            self.summary = _summary(stream, self.size)
+            self.summary = file_summary(stream, self.size)
             stream.seek(len(MAGIC))
             loose: list[Message] = []
             loose_bytes = 0
             for opcode, offset, length in self._records(stream):
                 if opcode == Opcode.CHUNK:
+                    self.chunked = True
                     if loose:
                         yield sorted(loose, key=itemgetter(1))
                         loose, loose_bytes = [], 0
                     if batch := self._chunk(stream, offset, length):
+                        self.last_ns = batch[-1].log_time_ns
                         yield batch
                 elif opcode in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
                     if length > MAX_CHUNK_BYTES:
@@ -179,12 +186,19 @@ class _FileWalk:
                     message = self._record(opcode, memoryview(stream.read(length)))
                     if message is not None:
                         loose.append(message)
+                        self.last_ns = message.log_time_ns
                         loose_bytes += length
                     if loose_bytes > BATCH_BYTES:
                         yield sorted(loose, key=itemgetter(1))
                         loose, loose_bytes = [], 0
             if loose:
                 yield sorted(loose, key=itemgetter(1))
+        self.log.count(
+            "message that the file's own summary counts is missing",
+            self.file.name,
+            "lost",
+            count=self.summary.messages - self.messages,
+        )
 
     def _records(self, stream: IO[bytes]) -> Iterator[tuple[int, int, int]]:
         """Opcode, offset and length of the content of every whole record of the data section.
@@ -194,23 +208,26 @@ class _FileWalk:
         position = len(MAGIC)
         while True:
             stream.seek(position)
-            head = stream.read(_RECORD.size)
-            opcode, length = _RECORD.unpack(head) if len(head) == _RECORD.size else (0, 0)
-            if opcode in (Opcode.DATA_END, Opcode.FOOTER):
+            head = stream.read(RECORD_HEAD.size)
+            opcode, length = RECORD_HEAD.unpack(head) if len(head) == RECORD_HEAD.size else (0, 0)
+            end = position + RECORD_HEAD.size + length
+            onward = self.summary.next_chunk(position)
+            is_end = opcode in (Opcode.DATA_END, Opcode.FOOTER)
+            if onward is None and is_end:
                 return
-            end = position + _RECORD.size + length
-            if opcode == 0 or end > self.size:
-                onward = self.summary.next_chunk(position)
-                if onward is None:
-                    self._ends_early(position)
-                    return
-                self.log.count(
-                    "unreadable record", self.file.name, "went on at the next chunk of the index"
-                )
-                position = onward
+            # A record that reaches over the next chunk of the index lies, and so does an early end.
+            if opcode != 0 and not is_end and end <= (onward or self.size):
+                yield opcode, position + RECORD_HEAD.size, length
+                position = end
                 continue
-            yield opcode, position + _RECORD.size, length
-            position = end
+            onward = onward or next_record(
+                stream, position + 1, self.size, self.last_ns, only_chunks=self.chunked
+            )
+            if onward is None:
+                self._ends_early(position)
+                return
+            self.log.count("unreadable record", self.file.name, "went on at the next sound one")
+            position = onward
 
     def _ends_early(self, position: int) -> None:
         megabytes = f"{position / 1e6:.1f} of {self.size / 1e6:.1f} MB"
@@ -223,6 +240,7 @@ class _FileWalk:
                 self.log.count("message too short", self.file.name, "left out")
                 return None
             channel_id, _, log_time, publish_time = _MESSAGE.unpack_from(data)
+            self.messages += 1
             channel = self._selected(channel_id)
             if channel is None or not self._is_time(log_time):
                 return None
@@ -234,7 +252,7 @@ class _FileWalk:
                 self.schemas[schema.id] = schema
             elif opcode == Opcode.CHANNEL:
                 self._add_channel(ChannelRecord.read(source))
-        except _DAMAGE:
+        except RECORD_DAMAGE:
             self.log.count("damaged schema or channel record", self.file.name, "left out")
         return None
 
@@ -284,7 +302,7 @@ class _FileWalk:
                 raise ValueError(f"it is {length / 2**20:.0f} MiB long, more than is credible")
             # Checksums need no second look in later passes: a damaged chunk holds no topics.
             data = chunk_content(stream.read(length), check=held is None)
-        except _DAMAGE as error:
+        except RECORD_DAMAGE as error:
             self.log.count("damaged chunk", self.file.name, f"left out ({_reason(error)})")
             self.log.remember_chunk(place, frozenset())
             return []
@@ -297,7 +315,11 @@ class _FileWalk:
         messages: list[Message] = []
         ids: set[int] = set()
         position, end = 0, len(data)
-        read_head, read_message, head_size = _RECORD.unpack_from, _MESSAGE.unpack_from, _RECORD.size
+        read_head, read_message, head_size = (
+            RECORD_HEAD.unpack_from,
+            _MESSAGE.unpack_from,
+            RECORD_HEAD.size,
+        )
         while position + head_size <= end:
             opcode, length = read_head(data, position)
             start = position + head_size
@@ -310,61 +332,13 @@ class _FileWalk:
                 continue
             channel_id, _, log_time, publish_time = read_message(data, start)
             ids.add(channel_id)
+            self.messages += 1
             channel = self._selected(channel_id)
             if channel is not None and self._is_time(log_time):
                 messages.append(
                     Message(channel, log_time, publish_time, data[start + 22 : position])
                 )
         return messages, {self.channels[i] for i in ids if i in self.channels}
-
-
-@dataclass
-class _Summary:
-    """What the end of an intact file says: a fallback where the data section is damaged."""
-
-    schemas: dict[int, Schema] = field(default_factory=dict)
-    channels: dict[int, ChannelRecord] = field(default_factory=dict)
-    chunk_offsets: list[int] = field(default_factory=list)
-
-    def next_chunk(self, position: int) -> int | None:
-        """Offset of the first chunk after a position, None if there is none."""
-        return min((offset for offset in self.chunk_offsets if offset > position), default=None)
-
-
-def _summary(stream: IO[bytes], size: int) -> _Summary:
-    found = _Summary()
-    tail_bytes = _RECORD.size + 20 + len(MAGIC)
-    if size < tail_bytes + len(MAGIC):
-        return found
-    stream.seek(size - tail_bytes)
-    tail = stream.read(tail_bytes)
-    opcode, length = _RECORD.unpack_from(tail)
-    if opcode != Opcode.FOOTER or length != 20 or not tail.endswith(MAGIC):
-        return found
-    start = Footer.read(ReadDataStream(BytesIO(tail[_RECORD.size :]))).summary_start
-    if not len(MAGIC) <= start < size - tail_bytes or size - start > MAX_CHUNK_BYTES:
-        return found
-    stream.seek(start)
-    data = memoryview(stream.read(size - tail_bytes - start))
-    position = 0
-    try:
-        while position + _RECORD.size <= len(data):
-            opcode, length = _RECORD.unpack_from(data, position)
-            position += _RECORD.size
-            source = ReadDataStream(BytesIO(data[position : position + length]))
-            position += length
-            if opcode == Opcode.SCHEMA:
-                schema = Schema.read(source)
-                found.schemas[schema.id] = schema
-            elif opcode == Opcode.CHANNEL:
-                channel = ChannelRecord.read(source)
-                found.channels[channel.id] = channel
-            elif opcode == Opcode.CHUNK_INDEX:
-                found.chunk_offsets.append(ChunkIndex.read(source).chunk_start_offset)
-    except _DAMAGE:
-        return _Summary()
-    found.chunk_offsets.sort()
-    return found
 
 
 def _reason(error: BaseException) -> str:

@@ -4,6 +4,7 @@ import csv
 import struct
 from pathlib import Path
 
+import mutations
 import numpy as np
 import pytest
 from logwriter import START_NS, LogWriter
@@ -21,6 +22,7 @@ needs_shared = pytest.mark.skipif(
     not SHARED.is_dir(), reason="the conformance files (../shared/data/mcap) are not here"
 )
 BYTES = ("bytes", "", b"")
+MISSING = "message that the file's own summary counts is missing"
 
 
 def read(path):
@@ -127,9 +129,13 @@ def test_a_flipped_bit_costs_its_chunk_and_is_counted_once(tmp_path, compression
     path.write_bytes(content)
     messages, losses, log = read(path)
     assert 150 < len(messages) < 200
-    assert [(loss.what, loss.count) for loss in losses] == [("damaged chunk", 1)]
+    missing = 200 - len(messages)
+    assert [(loss.what, loss.count) for loss in losses] == [
+        ("damaged chunk", 1),
+        (MISSING, missing),
+    ]
     assert len(list(log.messages())) == len(messages)
-    assert [loss.count for loss in losses] == [1]
+    assert [loss.count for loss in losses] == [1, missing]
 
 
 def test_a_broken_record_length_costs_no_more_than_the_way_to_the_next_chunk(tmp_path):
@@ -142,7 +148,31 @@ def test_a_broken_record_length_costs_no_more_than_the_way_to_the_next_chunk(tmp
     path.write_bytes(content)
     messages, losses, _ = read(path)
     assert len(messages) > 150
-    assert [loss.what for loss in losses] == ["unreadable record"]
+    assert [loss.what for loss in losses] == ["unreadable record", MISSING]
+
+
+@pytest.mark.parametrize("chunking", [True, False])
+def test_without_an_index_reading_goes_on_at_the_next_sound_record(tmp_path, chunking):
+    path = write(tmp_path / "log.mcap", use_chunking=chunking)
+    content = bytearray(path.read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 4096] = bytes(4096)
+    path.write_bytes(content[:-100])
+    messages, losses, _ = read(path)
+    assert len(messages) >= 160
+    assert numbers(messages)[-1] == 199
+    assert losses.data_lost
+
+
+def test_a_chunk_that_was_cut_out_is_missed_if_the_summary_counts_its_messages(tmp_path):
+    path = write(tmp_path / "log.mcap")
+    records = mutations.records_of(path.read_bytes())
+    del records[next(i for i, record in enumerate(records) if record[0] == 6)]
+    path.write_bytes(mutations.joined(records))
+    messages, losses, _ = read(path)
+    missing = 200 - len(messages)
+    assert missing > 0
+    assert [(loss.what, loss.count) for loss in losses] == [(MISSING, missing)]
 
 
 @pytest.mark.parametrize("claimed", ["as packed", "small"])
