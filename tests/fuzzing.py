@@ -95,7 +95,9 @@ class Fuzzing:
             path = small_logs.write(folder / f"{kind}.mcap", drive, **options)
             self.content[kind] = path.read_bytes()
             found = read(path)
-            assert found is not None and found.usable and not found.losses, found
+            assert found is not None
+            assert found.usable
+            assert not found.losses
             self.sound[kind] = found
 
     def complaints(self, seed: int) -> list[str]:

@@ -23,7 +23,7 @@ import fuzzing
 HANG_S = 20
 
 
-class TooLong(Exception):
+class TooLongError(Exception):
     """A log took longer than `HANG_S`."""
 
 
@@ -34,7 +34,7 @@ def damaged_logs(count: int, folder: Path) -> tuple[str, list[str]]:
     slowest = 0.0
 
     def too_long(*_: object) -> None:
-        raise TooLong
+        raise TooLongError
 
     signal.signal(signal.SIGALRM, too_long)
     for seed in range(count):
