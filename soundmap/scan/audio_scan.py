@@ -1,14 +1,18 @@
 r"""Audio scans: how loud each bearing is, ten times a second (Sect. 2.3, Eqs. 1-2).
 
 The room's last module: it cuts the stream of audio into scans, says when each was taken, and has
-it transformed, correlated and steered. Only one scan's worth of samples is ever kept.
+them transformed, correlated and steered, a batch at a time, by several threads if wanted. Only a
+few batches of samples are ever kept.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections import deque
 from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from threading import local
 from typing import Any
 
 import numpy as np
@@ -17,18 +21,18 @@ from numpy.typing import NDArray
 from soundmap.config import ScanConfig
 from soundmap.geometry import FloatArray
 from soundmap.losses import LossLedger
+from soundmap.scan.cross_spectra import BaselineSpectra
 from soundmap.scan.response import steered_response_power
-from soundmap.scan.spectrum import (
-    Band,
-    Framing,
-    band_bins,
-    band_spectrum,
-    cross_spectral_matrix,
-    hann_power,
-)
+from soundmap.scan.spectrum import Framing, band_bins, hann_power
 from soundmap.scan.steering import SteeringTable, steering_table
 from soundmap.sensors import AudioBlock, MicArray
 from soundmap.sound import REFERENCE_PRESSURE_PA, AudioScan
+
+BATCH = 32
+"""Scans that are steered by one matrix product; a shorter batch is filled up with nothing, so that
+no scan's rounding depends on how many follow it."""
+BATCH_BYTES = 2**24
+"""... but fewer where an array has so many baselines that their cross-spectra exceed this."""
 
 
 def audio_scans(
@@ -37,8 +41,9 @@ def audio_scans(
     config: ScanConfig,
     *,
     losses: LossLedger | None = None,
+    threads: int = 1,
 ) -> Iterator[AudioScan]:
-    r"""Audio scans :math:`\{\theta_n(k), J_n(k)\}` of a stream of audio, each once it is complete.
+    r"""Audio scans :math:`\{\theta_n(k), J_n(k)\}` of a stream of audio, in batches of about 3 s.
 
     A scan averages ``config.frames`` frames, and the next one starts that many shifts later:
     every 100 ms by default. Lengths are whole samples (see :meth:`Framing.from_times`). No scan
@@ -56,6 +61,9 @@ def audio_scans(
     config : ScanConfig
     losses : LossLedger, optional
         Counts scans left out because samples in them were not finite.
+    threads : int, optional
+        That many threads compute while the next blocks are read; with 1 the caller's own does. The
+        scans are the same, bit for bit.
 
     Yields
     ------
@@ -68,37 +76,88 @@ def audio_scans(
     ValueError
         If a block has not one channel a microphone, or the band does not fit its sample rate.
     """
-    stream: _Stream | None = None
-    scanner: _Scanner | None = None
-    for block in blocks:
-        if block.samples.shape[1] != array.microphones:
-            raise ValueError(
-                f"an audio block has {block.samples.shape[1]} channels, "
-                f"the array has {array.microphones} microphones"
-            )
-        if scanner is None or scanner.rate_hz != block.rate_hz:
-            scanner = _Scanner.of(array, config, block.rate_hz)
-        if stream is None or not stream.is_continued_by(block):
-            stream = _Stream(block.rate_hz, block.full_scale, scanner.framing)
-        stream.append(block)
-        square = _square_of_unit(array, block.full_scale)
-        del block  # a long one need not outlive its scans while the next is being read
-        yield from _complete_scans(stream, scanner, square, losses)
-        stream.keep_only_what_is_needed()
+    with _Workers(threads) as workers:
+        stream: _Stream | None = None
+        scanner: _Scanner | None = None
+        for block in blocks:
+            if block.samples.shape[1] != array.microphones:
+                raise ValueError(
+                    f"an audio block has {block.samples.shape[1]} channels, "
+                    f"the array has {array.microphones} microphones"
+                )
+            if stream is None or scanner is None or not stream.is_continued_by(block):
+                yield from _scans(workers, stream, scanner, losses, last=True)
+                if scanner is None or not scanner.suits(block):
+                    scanner = _Scanner.of(array, config, block.rate_hz, block.full_scale)
+                stream = _Stream(block.rate_hz, block.full_scale, scanner.framing)
+            stream.append(block)
+            del block  # a long one need not outlive its scans while the next is being read
+            yield from _scans(workers, stream, scanner, losses, last=False)
+            stream.keep_only_what_is_needed()
+        yield from _scans(workers, stream, scanner, losses, last=True)
+        while (batch := workers.next_result(wait=True)) is not None:
+            yield from _finite(batch, losses)
 
 
-def _complete_scans(
-    stream: _Stream, scanner: _Scanner, square_of_unit: float, losses: LossLedger | None
+def _scans(
+    workers: _Workers,
+    stream: _Stream | None,
+    scanner: _Scanner | None,
+    losses: LossLedger | None,
+    *,
+    last: bool,
 ) -> Iterator[AudioScan]:
-    """The scans whose samples are all there."""
-    while (excerpt := stream.next_excerpt()) is not None:
-        time_ns, samples = excerpt
-        power = scanner.power(samples) * square_of_unit
-        if np.all(np.isfinite(power)):
-            yield AudioScan(time_ns, scanner.table.bearing_rad, power)
+    """Sets the workers to the batches whose samples are all there; the scans done meanwhile."""
+    if stream is None or scanner is None:
+        return
+    while (excerpt := stream.next_excerpt(scanner.batch, last=last)) is not None:
+        workers.submit(scanner, *excerpt)
+        while (batch := workers.next_result(wait=False)) is not None:
+            yield from _finite(batch, losses)
+
+
+def _finite(batch: list[AudioScan], losses: LossLedger | None) -> Iterator[AudioScan]:
+    for scan in batch:
+        if np.all(np.isfinite(scan.power)):
+            yield scan
         elif losses is not None:
             what = "audio scan with samples that are not finite"
             losses.add(what, "audio", effect="scan left out")
+
+
+class _Workers:
+    """Threads that turn batches of samples into scans, in the order in which they were given."""
+
+    def __init__(self, threads: int) -> None:
+        self._threads = threads
+        self._pool = ThreadPoolExecutor(threads, "audio scan") if threads > 1 else None
+        self._waiting: deque[Future[list[AudioScan]]] = deque()
+
+    def __enter__(self) -> _Workers:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+
+    def submit(self, scanner: _Scanner, time_ns: list[int], samples: NDArray[Any]) -> None:
+        if self._pool is not None:
+            self._waiting.append(self._pool.submit(scanner.scans, time_ns, samples))
+            return
+        done: Future[list[AudioScan]] = Future()
+        done.set_result(scanner.scans(time_ns, samples))
+        self._waiting.append(done)
+
+    def next_result(self, *, wait: bool) -> list[AudioScan] | None:
+        """The next batch if it is done, waited for if more are waiting than there are threads.
+
+        None if there is no batch or, unless ``wait``, none done.
+        """
+        if not self._waiting:
+            return None
+        if wait or len(self._waiting) > self._threads or self._waiting[0].done():
+            return self._waiting.popleft().result()
+        return None
 
 
 def _square_of_unit(array: MicArray, full_scale: float) -> float:
@@ -110,15 +169,18 @@ def _square_of_unit(array: MicArray, full_scale: float) -> float:
 
 @dataclass(frozen=True)
 class _Scanner:
-    """What turning samples of one rate into power takes, worked out once."""
+    """What turning samples of one rate and full scale into power takes, worked out once."""
 
     rate_hz: float
+    full_scale: float
+    square_of_unit: float
     framing: Framing
-    band: Band
     table: SteeringTable
+    microphones: int
+    _own: local
 
     @classmethod
-    def of(cls, array: MicArray, config: ScanConfig, rate_hz: float) -> _Scanner:
+    def of(cls, array: MicArray, config: ScanConfig, rate_hz: float, full_scale: float) -> _Scanner:
         framing = Framing.from_times(
             rate_hz, window_s=config.window_s, hop_s=config.hop_s, frames=config.frames
         )
@@ -126,29 +188,49 @@ class _Scanner:
         table = steering_table(
             array.positions_m,
             config.bearings,
+            first_bin=band.first,
             frequency_hz=band.frequency_hz,
             weight=band.weight,
             speed_of_sound_m_s=config.speed_of_sound_m_s,
         )
-        return cls(rate_hz, framing, band, table)
+        square = _square_of_unit(array, full_scale)
+        return cls(rate_hz, full_scale, square, framing, table, array.microphones, local())
 
-    def power(self, samples: NDArray[Any]) -> FloatArray:
-        """:math:`J_n` of the samples of one scan, (span, Q) -> (N,) [count^2].
+    def suits(self, block: AudioBlock) -> bool:
+        """Whether the block's samples are of that rate and full scale."""
+        return block.rate_hz == self.rate_hz and block.full_scale == self.full_scale
 
-        Not finite if any sample is not.
+    @property
+    def batch(self) -> int:
+        """Scans in a batch."""
+        return int(np.clip(BATCH_BYTES // (4 * np.prod(self.table.spectra_shape)), 4, BATCH))
+
+    def scans(self, time_ns: list[int], samples: NDArray[Any]) -> list[AudioScan]:
+        """A batch of scans at these times from the samples (T, Q) of all.
+
+        The powers of a scan are not finite if any of its samples is not.
         """
+        power = self.power(samples, len(time_ns))
+        return [
+            AudioScan(time, self.table.bearing_rad, scan)
+            for time, scan in zip(time_ns, power, strict=True)
+        ]
+
+    def power(self, samples: NDArray[Any], scans: int) -> FloatArray:
+        """:math:`J_n` of consecutive scans, shape (scans, N) [square of the array's unit]."""
+        if not hasattr(self._own, "spectra"):  # each thread has memory of its own
+            self._own.spectra = BaselineSpectra(self.microphones, self.framing, self.table)
+        spectra = np.zeros((self.batch, *self.table.spectra_shape), dtype=np.float32)
+        finite = np.zeros(self.batch, dtype=bool)
         with np.errstate(invalid="ignore", over="ignore"):
-            channels = np.ascontiguousarray(samples.T).astype(np.float32)
-            span = channels.shape[1]
-            offset = channels @ np.full(span, 1.0 / span, dtype=np.float32)
-            if not np.all(np.isfinite(offset)):
-                return np.full(self.table.bearing_rad.shape, np.nan)
-            channels -= offset[:, None]
-            spectrum = band_spectrum(channels, self.framing, self.band)
-            power = steered_response_power(cross_spectral_matrix(spectrum), self.table)
-            squared_microphones = samples.shape[1] ** 2
-            norm = self.framing.frames * hann_power(self.framing.window) * squared_microphones
-            return power / norm
+            for i in range(scans):
+                start = i * self.framing.advance
+                excerpt = samples[start : start + self.framing.span]
+                finite[i] = self._own.spectra.add(excerpt, spectra[i])
+            raw = steered_response_power(spectra, self.table)[:scans, 0].astype(np.float64)
+            raw[~finite[:scans]] = np.nan
+            norm = self.framing.frames * hann_power(self.framing.window) * self.microphones**2
+            return raw * (self.square_of_unit / norm)
 
 
 @dataclass(frozen=True)
@@ -193,27 +275,38 @@ class _Stream:
             self._pieces.append(_Piece(self._end, block.samples, self._end, block.time_ns))
             self._end += len(block.samples)
 
-    def next_excerpt(self) -> tuple[int, NDArray[Any]] | None:
-        """Middle [ns] and samples (span, Q) of the next scan; None until they are complete."""
-        start, stop = self._next, self._next + self._framing.span
-        if stop > self._end:
+    def next_excerpt(self, most: int, *, last: bool) -> tuple[list[int], NDArray[Any]] | None:
+        """Middles [ns] of the next scans and their samples (T, Q), in memory of their own.
+
+        So many scans as wanted, or None until their samples are there; the rest if it is the last.
+        """
+        framing = self._framing
+        whole = (self._end - self._next - framing.span) // framing.advance + 1
+        scans = min(whole, most)
+        if scans < (1 if last else most):
             return None
+        start, stop = self._next, self._next + (scans - 1) * framing.advance + framing.span
         samples = [
             piece.samples[max(start - piece.first, 0) : stop - piece.first]
             for piece in self._pieces
             if piece.first < stop and piece.end > start
         ]
-        time_ns = self._time_ns(start + (self._framing.span - 1) / 2.0)
-        self._next += self._framing.advance
-        return time_ns, samples[0] if len(samples) == 1 else np.concatenate(samples)
+        half = (framing.span - 1) / 2.0
+        times = self._times_ns([start + i * framing.advance + half for i in range(scans)])
+        self._next += scans * framing.advance
+        return times, np.concatenate(samples)
 
-    def _time_ns(self, sample: float) -> int:
-        """Time of a sample, or of a point between two, by the clock of the block that holds it."""
-        piece = next(piece for piece in reversed(self._pieces) if piece.first <= sample)
-        return piece.time_ns + round((sample - piece.origin) * 1e9 / self._rate_hz)
+    def _times_ns(self, samples: list[float]) -> list[int]:
+        """Times of samples, or of points between two, by the clock of the block that holds each."""
+        firsts = [piece.first for piece in self._pieces]
+        times = []
+        for sample in samples:
+            piece = self._pieces[bisect_right(firsts, sample) - 1]
+            times.append(piece.time_ns + round((sample - piece.origin) * 1e9 / self._rate_hz))
+        return times
 
     def keep_only_what_is_needed(self) -> None:
-        """Let go of what scans are done with: never more than the samples of one scan are kept.
+        """Let go of what scans are done with: never more than the samples of a batch are kept.
 
         To be called after every block, the newest piece being the caller's memory until then.
         """

@@ -12,44 +12,49 @@ a real matrix product. Beside it stands the sum as the paper writes it, which is
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from soundmap.geometry import FloatArray
-from soundmap.scan.spectrum import Complex, Framing, band_bins, hann_power
+from soundmap.scan.spectrum import Framing, band_bins, hann_power
 from soundmap.scan.steering import SteeringTable, steering_vectors
 
 
-def steered_response_power(matrix: Complex, table: SteeringTable) -> FloatArray:
-    r"""Weighted sum over bins of :math:`a^H R a` on every bearing.
+def steered_response_power(
+    spectra: NDArray[np.float32], table: SteeringTable
+) -> NDArray[np.float32]:
+    r"""Weighted sum over bins of :math:`a^H R a` on every bearing, of many scans at a time.
 
     Parameters
     ----------
-    matrix : ndarray of complex, shape (K, Q, Q)
-        :math:`R`, cross-spectral matrix of each bin.
+    spectra : ndarray of float32, shape (S, 2, M, B, LANES)
+        Cross-spectra of each scan, real and imaginary, summed over the pairs of each baseline: see
+        :class:`~soundmap.scan.cross_spectra.BaselineSpectra`.
     table : SteeringTable
         Of the same bins and microphones.
 
     Returns
     -------
-    ndarray, shape (N,)
-        [square of the spectrum's unit], >= 0. Divided by the frames summed, by
-        :func:`~soundmap.scan.spectrum.hann_power` and by :math:`Q^2` it is :math:`J_n`.
+    ndarray of float32, shape (S, G, N)
+        Of each group of bins [square of the spectrum's unit], >= 0. Divided by the frames summed,
+        by :func:`~soundmap.scan.spectrum.hann_power` and by :math:`Q^2` it is :math:`J_n`.
     """
-    bins, microphones = matrix.shape[:2]
-    flat = matrix.reshape(bins, microphones**2)
-    trace = table.weight @ flat[:, :: microphones + 1].real.sum(axis=1)
-    if len(table.baselines) == 0:
-        return np.full(table.bearing_rad.shape, float(trace))
-    layers = table.baselines.layers
-    merged = flat.take(layers[0], axis=1)
-    for layer in layers[1:]:
-        merged[:, : len(layer)] += flat.take(layer, axis=1)
-    even = table.cosine @ merged.real.ravel()
-    odd = table.sine @ merged.imag.ravel()
-    steered = np.concatenate([even + odd, even - odd]) if table.halved else even + odd
+    rows = len(table.cosine)
+    steered = [
+        (
+            table.cosine[:, start:stop].reshape(rows, -1)
+            @ spectra[:, 0, start:stop].reshape(len(spectra), -1).T,
+            table.sine[:, start:stop].reshape(rows, -1)
+            @ spectra[:, 1, start:stop].reshape(len(spectra), -1).T,
+        )
+        for start, stop in pairwise(table.group_blocks)
+    ]
+    even, odd = (np.stack(part).transpose(2, 0, 1) for part in zip(*steered, strict=True))
+    power = np.concatenate([even + odd, even - odd], axis=2) if table.halved else even + odd
     # Where the array hears nothing, rounding may leave a little less than nothing.
-    return np.maximum(trace + steered.astype(np.float64), 0.0)
+    return np.maximum(power, np.float32(0.0))
 
 
 def steered_response_power_direct(

@@ -3,12 +3,15 @@ r"""Steering: how a plane wave from each bearing reaches the microphones (Sect. 
 A wave from bearing :math:`\theta`, unit vector u, reaches the microphone at r earlier than the
 array's origin by :math:`r \cdot u / c`. Between two microphones only the baseline
 :math:`r_m - r_n` matters, and arrays repeat their baselines: 16 microphones on a circle have 120
-pairs but 64 baselines. Bearings lie in the array's x-y plane; heights have no part in them.
+pairs but 64 baselines. A microphone with itself is a pair without a baseline. Bearings lie in the
+array's x-y plane; heights have no part in them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +21,10 @@ from soundmap.geometry import FloatArray
 PHASE_TOLERANCE_RAD = 1e-4
 """Baselines are one if merging them moves no phase by more than this. At 6 kHz that is 0.9 um
 about their mean: positions that a file gives in whole micrometres still merge."""
+
+
+LANES = 32
+"""Bins that are worked on at a time: enough to fill two of a processor's widest registers."""
 
 
 def scan_bearings(count: int) -> FloatArray:
@@ -72,19 +79,24 @@ def steering_vectors(
 
 @dataclass(frozen=True)
 class Baselines:
-    """The distinct baselines of an array, those of most pairs first.
+    """The distinct baselines of an array and the pairs of microphones that have them.
 
     Attributes
     ----------
     vector_m : ndarray, shape (B, 2)
-        :math:`r_m - r_n` in the array's plane, mean over its pairs [m].
-    layers : tuple of ndarray of int
-        Element b of layer i is m * Q + n of the i-th pair (m, n) with baseline b. Later layers
-        are shorter. A pair that runs the other way is listed as (n, m).
+        :math:`r_m - r_n` in the array's plane, mean over its pairs [m]; nought for the first, which
+        is every microphone's with itself. Then those of most pairs come first.
+    first, second : ndarray of int, shape (P,)
+        m and n of each pair. A pair that runs the other way is listed as (n, m).
+    baseline : ndarray of int, shape (P,)
+        Which baseline each pair has. Neighbours in the list differ in it where they can, so that
+        a sum over pairs need not wait for its last term.
     """
 
     vector_m: FloatArray
-    layers: tuple[NDArray[np.intp], ...]
+    first: NDArray[np.uintp]
+    second: NDArray[np.uintp]
+    baseline: NDArray[np.uintp]
 
     def __len__(self) -> int:
         return len(self.vector_m)
@@ -102,14 +114,14 @@ def distinct_baselines(positions_m: FloatArray, *, tolerance_m: float) -> Baseli
 
     Examples
     --------
-    Four microphones on a square: six pairs, of which two are parallel twice.
+    Four microphones on a square: six pairs, of which two are parallel twice; and no baseline.
 
     >>> corners = np.array([[1.0, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]])
     >>> len(distinct_baselines(corners, tolerance_m=1e-6))
-    4
+    5
     """
     count = len(positions_m)
-    pairs: list[list[int]] = []
+    pairs: list[list[tuple[int, int]]] = []
     members: list[FloatArray] = []
     means = np.empty((count * (count - 1) // 2, 2))
     for m in range(count):
@@ -119,19 +131,20 @@ def distinct_baselines(positions_m: FloatArray, *, tolerance_m: float) -> Baseli
             if found is None:
                 means[len(pairs)] = baseline
                 members.append(baseline[None])
-                pairs.append([m * count + n])
+                pairs.append([(m, n)])
                 continue
             group, sign = found
             members[group] = np.vstack([members[group], sign * baseline])
             means[group] = members[group].mean(axis=0)
-            pairs[group].append(m * count + n if sign > 0 else n * count + m)
+            pairs[group].append((m, n) if sign > 0 else (n, m))
     order = sorted(range(len(pairs)), key=lambda group: -len(pairs[group]))
-    depth = len(pairs[order[0]]) if order else 0
-    layers = tuple(
-        np.array([pairs[group][i] for group in order if len(pairs[group]) > i], dtype=np.intp)
-        for i in range(depth)
-    )
-    return Baselines(means[order], layers)
+    lists = [[(q, q) for q in range(count)], *(pairs[group] for group in order)]
+    depth = max(len(pairs) for pairs in lists)
+    table = [
+        (*pairs[i], b) for i in range(depth) for b, pairs in enumerate(lists) if i < len(pairs)
+    ]
+    first, second, baseline = np.array(table, dtype=np.uintp).T.copy()
+    return Baselines(np.vstack([np.zeros((1, 2)), means[order]]), first, second, baseline)
 
 
 def _joined(
@@ -155,21 +168,28 @@ def _joined(
 class SteeringTable:
     """Weighted cosines and sines of the phase that each baseline has on each bearing.
 
+    The bins of a band are cut into blocks of `LANES`; the last of each group is filled up with
+    bins of no weight.
+
     Attributes
     ----------
     bearing_rad : ndarray, shape (N,)
         All bearings [rad].
     baselines : Baselines
-    weight : ndarray of float32, shape (K,)
-        Weight of each bin.
-    cosine, sine : ndarray of float32, shape (N or N / 2, K * B)
-        Twice the weight times cos and sin. With an even N only the first half of the bearings:
-        the opposite bearing has the same cosine and the opposite sine.
+    block_bin : ndarray of int, shape (M,)
+        Lowest bin of each block.
+    group_blocks : tuple of int, length G + 1
+        The first block of each group of bins, and their number.
+    cosine, sine : ndarray of float32, shape (N or N / 2, M, B, LANES)
+        The weight, for pairs of different microphones twice the weight, times cos and sin. With an
+        even N only the first half of the bearings: the opposite bearing has the same cosine and
+        the opposite sine.
     """
 
     bearing_rad: FloatArray
     baselines: Baselines
-    weight: NDArray[np.float32]
+    block_bin: NDArray[np.intp]
+    group_blocks: tuple[int, ...]
     cosine: NDArray[np.float32]
     sine: NDArray[np.float32]
 
@@ -178,14 +198,21 @@ class SteeringTable:
         """Whether the tables hold only the first half of the bearings."""
         return len(self.cosine) < len(self.bearing_rad)
 
+    @property
+    def spectra_shape(self) -> tuple[int, int, int, int]:
+        """(2, M, B, LANES): real and imaginary parts of the cross-spectra of one scan."""
+        return (2, len(self.block_bin), len(self.baselines), LANES)
+
 
 def steering_table(
     positions_m: FloatArray,
     bearings: int,
     *,
+    first_bin: int,
     frequency_hz: FloatArray,
     weight: FloatArray,
     speed_of_sound_m_s: float,
+    splits: Sequence[int] = (),
 ) -> SteeringTable:
     """Table for equally spaced bearings and the bins of a band.
 
@@ -195,20 +222,46 @@ def steering_table(
         Microphones in the array's frame [m].
     bearings : int
         :math:`N`.
+    first_bin : int
+        Lowest bin of the band.
     frequency_hz, weight : ndarray, shape (K,)
         Bins of the band [Hz], and what the square of each counts for.
     speed_of_sound_m_s : float
         c [m/s].
+    splits : sequence of int, optional
+        Where to split the band into groups of bins (sub-bands) whose power is told apart: the
+        index, rising and inside (0, K), of the bin with which each group but the first begins.
     """
     wavenumber = 2.0 * np.pi * frequency_hz / speed_of_sound_m_s
     tolerance_m = PHASE_TOLERANCE_RAD / float(wavenumber.max())
     baselines = distinct_baselines(positions_m, tolerance_m=tolerance_m)
     bearing = scan_bearings(bearings)
     kept = bearing if bearings % 2 else bearing[: bearings // 2]
-    cosine = np.empty((len(kept), len(wavenumber) * len(baselines)), dtype=np.float32)
+    block, group_blocks = _blocks(len(weight), splits)
+    lane = block[:, None] + np.arange(LANES)
+    ends = np.append(block[1:], len(weight))
+    inside = lane < ends[:, None]
+    lane = np.minimum(lane, len(weight) - 1)
+    counts = np.where(np.arange(len(baselines)) == 0, 1.0, 2.0)
+    factor = np.where(inside, weight[lane], 0.0)[:, None, :] * counts[:, None]
+    cosine = np.empty((len(kept), *factor.shape), dtype=np.float32)
     sine = np.empty_like(cosine)
     for row, toward in enumerate(direction(kept)):  # one bearing at a time: tables can be large
-        phase = wavenumber[:, None] * (baselines.vector_m @ toward)
-        cosine[row] = (2.0 * weight[:, None] * np.cos(phase)).ravel()
-        sine[row] = (2.0 * weight[:, None] * np.sin(phase)).ravel()
-    return SteeringTable(bearing, baselines, weight.astype(np.float32), cosine, sine)
+        phase = wavenumber[lane][:, None, :] * (baselines.vector_m @ toward)[:, None]
+        cosine[row] = factor * np.cos(phase)
+        sine[row] = factor * np.sin(phase)
+    return SteeringTable(bearing, baselines, first_bin + block, group_blocks, cosine, sine)
+
+
+def _blocks(bins: int, splits: Sequence[int]) -> tuple[NDArray[np.intp], tuple[int, ...]]:
+    """Index of the lowest bin of each block, and the first block of each group, all counted."""
+    blocks: list[int] = []
+    group_blocks = [0]
+    for start, stop in pairwise([0, *splits, bins]):
+        if not start < stop:
+            raise ValueError(
+                f"splits {list(splits)} do not rise inside the {bins} bins of the band"
+            )
+        blocks += range(start, stop, LANES)
+        group_blocks.append(len(blocks))
+    return np.array(blocks, dtype=np.intp), tuple(group_blocks)

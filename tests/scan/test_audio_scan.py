@@ -217,17 +217,65 @@ def test_the_blocks_lengths_do_not_matter():
             assert np.allclose(scan.power * 32768.0**2, part.power, rtol=1e-12, atol=0)
 
 
-def test_a_scan_leaves_with_the_block_that_completes_it():
-    samples = np.random.default_rng(11).standard_normal((48000, 3))
+def test_scans_leave_in_batches_with_the_block_that_completes_one():
+    samples = np.random.default_rng(11).standard_normal((336000, 3))
     read = []
 
     def counted():
-        for block in blocks_of(samples, RATE, [480] * 99):
+        for block in blocks_of(samples, RATE, [480] * 699):
             read.append(len(block.samples))
             yield block
 
     complete = [sum(read) for _ in audio_scans(counted(), mic_array(circle(3)), PAPER)]
-    assert complete == [5760 + 4800 * k for k in range(9)]  # 5520 samples in blocks of 480
+    # 31 scans of 4800 samples and one of 5520, in blocks of 480; and 5 scans with the last block.
+    assert complete == [154560] * 32 + [308160] * 32 + [336000] * 5
+
+
+def test_threads_change_nothing():
+    rng = np.random.default_rng(16)
+    array = mic_array(circle(5))
+    first, second = rng.standard_normal((2, 400000, 5))
+    second[[1000, 200000]] = np.nan
+
+    def blocks():
+        yield from blocks_of(first, RATE, [9600] * 41)
+        yield from blocks_of(second, RATE, [9600] * 41, start_ns=START_NS + 10**10)
+
+    ledgers = [LossLedger() for _ in range(3)]
+    one, two, three = (
+        list(audio_scans(blocks(), array, PAPER, threads=threads, losses=losses))
+        for threads, losses in zip((1, 2, 3), ledgers, strict=True)
+    )
+    assert len(one) == 2 * 83 - 2
+    for many in (two, three):
+        assert [scan.time_ns for scan in many] == [scan.time_ns for scan in one]
+        assert all(np.array_equal(a.power, b.power) for a, b in zip(many, one, strict=True))
+    assert [loss.count for ledger in ledgers for loss in ledger] == [2, 2, 2]
+
+
+def test_threads_never_run_far_behind_the_reading():
+    samples = np.zeros((2_000_000, 3), dtype=np.int16)
+    read = 0
+
+    def counted():
+        nonlocal read
+        for block in blocks_of(samples, RATE, [9600] * 208):
+            read += len(block.samples)
+            yield block
+
+    scans = audio_scans(counted(), mic_array(circle(3)), PAPER, threads=2)
+    for number, _ in enumerate(scans):
+        assert read - number * 4800 <= 5 * 32 * 4800
+    assert number == 415
+
+
+def test_an_error_of_the_reader_comes_through_the_threads():
+    def blocks():
+        yield from blocks_of(np.zeros((200000, 3)), RATE, [9600] * 20)
+        raise OSError("the disk is gone")
+
+    with pytest.raises(OSError, match="the disk is gone"):
+        list(audio_scans(blocks(), mic_array(circle(3)), PAPER, threads=2))
 
 
 def test_a_long_block_is_let_go_before_the_next_is_read():
