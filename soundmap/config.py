@@ -289,7 +289,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: cannot be read ({error.strerror}). Check --config.") from None
     except UnicodeDecodeError:
         raise ConfigError(f"{path}: not a text file. --config takes TOML files.") from None
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: not valid TOML: {error}") from None
 
 

@@ -5,6 +5,7 @@ The image's first row is the top of the map; an `OccupancyGrid`'s first row is t
 
 from __future__ import annotations
 
+import reprlib
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,10 @@ FREE_PIXEL, OCCUPIED_PIXEL, UNKNOWN_PIXEL = 254, 0, 205
 OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196
 MAX_CELLS = 400_000_000
 """A map of 1 km x 1 km at 5 cm; anything larger is taken for a mistake."""
+
+_SHORTENED = reprlib.Repr()
+_SHORTENED.maxlevel = 2  # YAML's aliases can multiply without end when they are written out
+_short = _SHORTENED.repr
 
 
 def read_map(path: Path) -> OccupancyGrid:
@@ -73,7 +78,7 @@ def _read_description(path: Path) -> dict[str, Any]:
         found = YAML(typ="safe", pure=True).load(path.read_bytes())
     except OSError as error:
         raise MapError(f"{path}: the map cannot be read ({error.strerror}). {expected}") from None
-    except (YAMLError, ValueError):
+    except (YAMLError, ValueError, RecursionError):
         raise MapError(f"{path}: not a YAML file. {expected}") from None
     if not isinstance(found, dict):
         raise MapError(f"{path}: no description of a map. {expected}")
@@ -88,9 +93,14 @@ def _read_description(path: Path) -> dict[str, Any]:
         sound, resolution = False, 0.0
     if not sound or not 0 < resolution < 10:
         raise MapError(
-            f"{path}: resolution {found['resolution']!r}, origin {numbers!r}; expected metres a "
-            "cell, and x, y, yaw of the lower-left corner."
+            f"{path}: resolution {_short(found['resolution'])}, origin {_short(numbers)}; "
+            "expected metres a cell, and x, y, yaw of the lower-left corner."
         )
+    for key in {"occupied_thresh", "free_thresh"} & found.keys():
+        if not isinstance(found[key], int | float) or not 0 <= found[key] <= 1:
+            raise MapError(f"{path}: {key} {_short(found[key])}; expected a share from 0 to 1.")
+    if not isinstance(found["image"], str):
+        raise MapError(f"{path}: image {_short(found['image'])}; expected the name of a file.")
     return found
 
 
@@ -98,7 +108,7 @@ def _read_image(path: Path, description: dict[str, Any]) -> NDArray[np.uint8]:
     """Grey values 0..255, first row at the bottom of the map."""
     from PIL import Image, UnidentifiedImageError
 
-    file = path.parent / str(description["image"])
+    file = path.parent / description["image"]
     try:
         with Image.open(file) as image:
             if image.width * image.height > MAX_CELLS:

@@ -7,6 +7,9 @@ from typing import Any
 
 from soundmap.errors import LogError
 
+PACKED = {".zstd": "zstd -d", ".zst": "zstd -d", ".lz4": "lz4 -d -m", ".gz": "gunzip -k"}
+"""Endings of files that are compressed as a whole, and what unpacks them."""
+
 
 def log_files(path: Path) -> tuple[Path, ...]:
     """The MCAP files of a log in the order they were recorded.
@@ -43,7 +46,7 @@ def _splits(folder: Path) -> tuple[Path, ...]:
             f"{folder}"
         )
     information = _bag_information(metadata)
-    _refuse_compression(folder, information)
+    _refuse_other_storage(folder, information)
     names = information.get("relative_file_paths")
     if not isinstance(names, list) or not names or not all(isinstance(n, str) for n in names):
         raise LogError(f"{metadata}: names no files (relative_file_paths). Is it a rosbag2 folder?")
@@ -56,7 +59,7 @@ def _bag_information(metadata: Path) -> dict[str, Any]:
 
     try:
         content = YAML(typ="safe", pure=True).load(metadata.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, YAMLError, ValueError) as error:
+    except (OSError, UnicodeDecodeError, YAMLError, ValueError, RecursionError) as error:
         first_line = (str(error) or type(error).__name__).splitlines()[0]
         raise LogError(f"{metadata}: cannot be read ({first_line}).") from None
     information = content.get("rosbag2_bagfile_information") if isinstance(content, dict) else None
@@ -65,23 +68,14 @@ def _bag_information(metadata: Path) -> dict[str, Any]:
     return information
 
 
-def _refuse_compression(folder: Path, information: dict[str, Any]) -> None:
+def _refuse_other_storage(folder: Path, information: dict[str, Any]) -> None:
     storage = information.get("storage_identifier", "mcap")
+    if not isinstance(storage, str):
+        storage = "something else"
     if storage != "mcap":
         raise LogError(
             f"{folder}: stored as {storage!r}, expected 'mcap'. Convert it: ros2 bag convert, or "
             "mcap convert."
-        )
-    mode = str(information.get("compression_mode") or "").upper()
-    if mode == "MESSAGE":
-        raise LogError(
-            f"{folder}: every message is compressed by itself (compression_mode MESSAGE), which "
-            "cannot be read. Convert it: ros2 bag convert with compression_mode: ''."
-        )
-    if mode == "FILE":
-        raise LogError(
-            f"{folder}: its files are compressed as a whole. Unpack them (zstd -d {folder}/*.zstd) "
-            "and give the .mcap file, or rewrite metadata.yaml: ros2 bag reindex -s mcap."
         )
 
 
@@ -90,10 +84,17 @@ def _inside(folder: Path, name: str) -> Path:
     root = folder.resolve()
     # Old rosbag2 wrote the folder's own name in front.
     candidates = [root / name, root / Path(name).name]
+    # Whoever has unpacked a compressed file need not change the description.
+    candidates += [file.with_suffix("") for file in candidates if file.suffix in PACKED]
     for candidate in candidates:
         file = candidate.resolve()
         if not file.is_relative_to(root):
             raise LogError(f"{folder}/metadata.yaml: {name!r} lies outside the folder; refused.")
-        if file.is_file():
+        if file.is_file() and file.suffix not in PACKED:
             return file
+    if Path(name).suffix in PACKED:
+        raise LogError(
+            f"{folder}: its files are compressed as a whole. Unpack them beside the packed ones "
+            f"and try again: {PACKED[Path(name).suffix]} {folder}/*{Path(name).suffix}"
+        )
     raise LogError(f"{folder}: metadata.yaml names {name!r}, which is missing. Copy it there.")

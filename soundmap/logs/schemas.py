@@ -13,6 +13,11 @@ from typing import Any
 
 from soundmap.logs.reader import Channel
 
+MAX_MESSAGE_BYTES = 64 * 2**20
+"""A packed message that would expand to more than this is taken for damaged."""
+
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+
 MAX_DEPTH = 8
 """Definitions may refer to themselves; fields nested deeper than this are not looked at."""
 
@@ -117,13 +122,26 @@ def _ros_type(channel: Channel) -> MessageType:
 
         def decoded(data: memoryview) -> Any:
             try:
-                return decode(data, name)
+                return decode(data if ros1 else _unpacked(data), name)
             except (SerdeError, ValueError, IndexError, MemoryError) as error:
                 raise MessageError(str(error)) from None
 
         return decoded
 
     return MessageType(fields, decoder, built_in)
+
+
+def _unpacked(data: memoryview) -> memoryview:
+    """A CDR message, which rosbag2 can compress by itself; the log does not say so."""
+    if data[:4] != _ZSTD_MAGIC:
+        return data
+    import zstandard
+
+    try:
+        packed = zstandard.ZstdDecompressor()
+        return memoryview(packed.decompress(data, max_output_size=MAX_MESSAGE_BYTES))
+    except zstandard.ZstdError as error:
+        raise MessageError(str(error)) from None
 
 
 def _ros_definitions(channel: Channel, name: str) -> dict[str, Any]:

@@ -127,7 +127,7 @@ def _refuse_to_replace(folder: Path, target: Path, *, force: bool, inputs: list[
 def _is_of_soundmap(folder: Path) -> bool:
     try:
         report = json.loads((folder / REPORT).read_bytes())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return False
     return isinstance(report, dict) and "soundmap" in report
 

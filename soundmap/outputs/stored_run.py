@@ -32,6 +32,9 @@ from soundmap.sound import (
     SourceList,
 )
 
+MAX_ARCHIVE_BYTES = 2 * 2**30
+"""An archive that expands to more than this is not one of a run."""
+
 POWER_MAP, POWER_RATIO = "power_map.npz", "power_ratio.npz"
 
 Stored = Mapping[str, NDArray[Any]]
@@ -158,7 +161,7 @@ def read_report(folder: Path) -> dict[str, Any]:
         report = json.loads(file.read_bytes())
     except OSError:
         raise _no_run_folder(folder, REPORT) from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise _damaged(file, str(error)) from None
     if not isinstance(report, dict):
         raise _damaged(file, "no JSON object")
@@ -172,6 +175,9 @@ def _read(folder: Path, name: str, content: Callable[[Stored], _Content]) -> _Co
         raise _no_run_folder(folder, name)
     try:
         with file.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
+            expanded = sum(member.file_size for member in stored.zip.infolist())
+            if expanded > MAX_ARCHIVE_BYTES:
+                raise ValueError(f"it would expand to {expanded / 2**20:.0f} MiB")
             version = int(stored["schema_version"])
             if version > SCHEMA_VERSION:
                 raise LogError(

@@ -864,6 +864,42 @@ def test_messages_of_nonsense_are_counted_and_the_rest_is_used(log_path):
 # Whole files
 
 
+def test_messages_that_rosbag2_packed_one_by_one_are_read(tmp_path):
+    import zstandard
+
+    pack = zstandard.ZstdCompressor().compress
+    plain = opened(tmp_path / "plain.mcap", static, drive, scans, frames)
+    with LogWriter(tmp_path / "packed.mcap") as log:
+        raw = log.raw
+        log.raw = lambda topic, schema, encoding, data, *times: raw(
+            topic, schema, encoding, pack(data), *times
+        )
+        for part in (static, drive, scans, frames):
+            part(log)
+    (tmp_path / "metadata.yaml").write_text(
+        "rosbag2_bagfile_information:\n  storage_identifier: mcap\n  compression_format: zstd\n"
+        "  compression_mode: MESSAGE\n  relative_file_paths: [packed.mcap]\n"
+    )
+    packed = open_log(tmp_path, CONFIG)
+    np.testing.assert_array_equal(sound(packed), sound(plain))
+    np.testing.assert_array_equal(packed.odometry.pose, plain.odometry.pose)
+    assert len(list(packed.lasers())) == 20
+    assert what(packed) == {}
+
+
+def test_a_packed_message_that_would_fill_the_memory_is_left_out(log_path):
+    import zstandard
+
+    def bomb(log):
+        name = "audio_utils_msgs/msg/AudioFrame"
+        data = zstandard.ZstdCompressor().compress(bytes(2**27))
+        log.raw("/audio", (name, "ros2msg", b""), "cdr", data, START_NS + SECOND)
+
+    log = opened(log_path, static, drive, scans, frames, bomb)
+    np.testing.assert_array_equal(sound(log), DATA)
+    assert what(log)["damaged audio message"] == 1
+
+
 def test_a_folder_with_transforms_in_its_first_file_only_is_one_log(tmp_path):
     folder = tmp_path / "bag"
     folder.mkdir()
