@@ -118,14 +118,12 @@ class MappingConfig(Table):
 
 
 class LocalizeConfig(Table):
-    """Particle filter of Sect. 2.2."""
+    """Robot localization, Sect. 2.2. Without smoothing, the particle filter's keys apply."""
 
     seed: Annotated[int, Field(ge=0)] = 1
     """Seed of the random numbers: the same log gives the same trajectory."""
     particles: Count = 300
-    """:math:`M`, particles while tracking."""
-    global_particles: Count = 3000
-    """Particles while the start is being sought."""
+    """:math:`M`, particles."""
     beams: Count = 60
     """Rays used of each laser scan, spread evenly over its valid ones."""
     update_distance_m: NotNegative = 0.10

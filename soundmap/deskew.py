@@ -8,9 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from soundmap.geometry import FloatArray, Trajectory, relative, transformed
+from soundmap.geometry import FloatArray, Trajectory
 from soundmap.sensors import LaserScan
 
 
@@ -71,15 +72,66 @@ def deskewed_rays(
     valid = np.flatnonzero(np.isfinite(scan.range_m))
     if most is not None and len(valid) > most:
         valid = valid[_evenly(len(valid), most)]
-    end = scan.mount.base_points(scan.bearing_rad[valid], scan.range_m[valid])
-    origin = np.broadcast_to(scan.mount.translation_m[:2], end.shape)
-    base_then = track.at(scan.ray_time_ns[valid])
-    base_now = track.at(time_ns)
-    motion = relative(base_now, base_then)
-    known = np.isfinite(motion).all(axis=-1)
-    motion, end, origin = motion[known], end[known], origin[known]
-    return Rays(time_ns, transformed(motion, origin), transformed(motion, end))
+    ends = scan.mount.base_points(scan.bearing_rad[valid], scan.range_m[valid])
+    known, origins, ends = _taken(
+        track.time_ns,
+        track.pose,
+        scan.ray_time_ns[valid],
+        time_ns,
+        scan.mount.translation_m[:2],
+        ends,
+    )
+    return Rays(time_ns, origins[known], ends[known])
 
 
 def _evenly(count: int, most: int) -> NDArray[np.int64]:
     return (np.arange(most) * count + count // 2) // most
+
+
+@njit(cache=True, nogil=True)
+def interpolated_pose(
+    time_ns: NDArray[np.int64], pose: FloatArray, wanted_ns: int
+) -> tuple[float, float, float]:
+    """`Trajectory.at` for a single time, from the arrays of the trajectory: x, y, heading."""
+    last = len(time_ns) - 1
+    if last < 0 or wanted_ns < time_ns[0] or wanted_ns > time_ns[last]:
+        return np.nan, np.nan, np.nan
+    left = int(np.searchsorted(time_ns, wanted_ns, side="right")) - 1
+    right = min(left + 1, last)
+    share = (wanted_ns - time_ns[left]) / max(time_ns[right] - time_ns[left], 1)
+    turn = (pose[right, 2] - pose[left, 2] + np.pi) % (2.0 * np.pi) - np.pi
+    return (
+        pose[left, 0] + share * (pose[right, 0] - pose[left, 0]),
+        pose[left, 1] + share * (pose[right, 1] - pose[left, 1]),
+        (pose[left, 2] + share * turn + np.pi) % (2.0 * np.pi) - np.pi,
+    )
+
+
+@njit(cache=True, nogil=True)
+def _taken(
+    time_ns: NDArray[np.int64],
+    pose: FloatArray,
+    ray_ns: NDArray[np.int64],
+    now_ns: int,
+    origin: FloatArray,
+    end: FloatArray,
+) -> tuple[NDArray[np.bool_], FloatArray, FloatArray]:
+    """Rays taken from the base frames of their own times to that of one time.
+
+    Returns which of them have a known time, where they started and where they ended, (B, 2).
+    """
+    known = np.zeros(len(end), dtype=np.bool_)
+    origins, ends = np.empty(end.shape), np.empty(end.shape)
+    now_x, now_y, now_heading = interpolated_pose(time_ns, pose, now_ns)
+    now_cos, now_sin = np.cos(now_heading), np.sin(now_heading)
+    for k in range(len(end)):
+        x, y, heading = interpolated_pose(time_ns, pose, ray_ns[k])
+        known[k] = np.isfinite(x) and np.isfinite(now_x)
+        dx, dy = x - now_x, y - now_y
+        shift_x, shift_y = now_cos * dx + now_sin * dy, now_cos * dy - now_sin * dx
+        cos, sin = np.cos(heading - now_heading), np.sin(heading - now_heading)
+        origins[k, 0] = shift_x + cos * origin[0] - sin * origin[1]
+        origins[k, 1] = shift_y + sin * origin[0] + cos * origin[1]
+        ends[k, 0] = shift_x + cos * end[k, 0] - sin * end[k, 1]
+        ends[k, 1] = shift_y + sin * end[k, 0] + cos * end[k, 1]
+    return known, origins, ends

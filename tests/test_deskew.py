@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import worlds
 
-from soundmap.deskew import deskewed_rays
-from soundmap.geometry import Mount, Trajectory, transformed
+from soundmap.deskew import deskewed_rays, interpolated_pose
+from soundmap.geometry import Mount, Trajectory, relative, transformed
 from soundmap.sensors import LaserScan
 
 
@@ -58,3 +58,18 @@ def test_rays_outside_the_time_of_the_track_are_left_out():
     mount = Mount.planar(0, 0, 0, 0)
     scan = LaserScan(end - 500_000, 10_000, bearing, np.full(100, 2.0), 30.0, mount, 0)
     assert len(deskewed_rays(scan, truth, end)) == pytest.approx(51, abs=1)
+
+
+def test_the_kernels_agree_with_the_plain_form():
+    truth = turning(rate_rad_s=3.0)
+    scan = worlds.laser_scans(truth, [worlds.BACK])[5]
+    now = truth.at(scan.middle_ns)
+    motion = relative(now, truth.at(scan.ray_time_ns))
+    points = scan.mount.base_points(scan.bearing_rad, scan.range_m)
+    rays = deskewed_rays(scan, truth, scan.middle_ns)
+    assert rays.end_m == pytest.approx(transformed(motion, points), abs=1e-9)
+    origin = scan.mount.translation_m[:2]
+    assert rays.origin_m == pytest.approx(transformed(motion, origin), abs=1e-9)
+    for time_ns in (-1, 0, 123_456_789, 1_000_000_000, 1_000_000_001):
+        one = interpolated_pose(truth.time_ns, truth.pose, time_ns)
+        assert one == pytest.approx(truth.at(time_ns), abs=1e-12, nan_ok=True)

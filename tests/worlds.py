@@ -17,22 +17,26 @@ OUTLINE = np.array([[0, 0], [7, 0], [7, 3], [4.5, 3], [4.5, 5], [0, 5], [0, 3.2]
 PILLAR = np.array([[2.0, 2.0], [2.5, 2.0], [2.5, 2.6], [2.0, 2.6]]) + HALF
 
 
-def segments() -> np.ndarray:
+RINGS = (OUTLINE, PILLAR)
+
+
+def segments(rings: tuple[np.ndarray, ...] = RINGS) -> np.ndarray:
     """Walls as segments, shape (S, 2, 2)."""
-    rings = [OUTLINE, PILLAR]
     return np.concatenate([np.stack([ring, np.roll(ring, -1, axis=0)], axis=1) for ring in rings])
 
 
-def room() -> OccupancyGrid:
-    """The room as a grid: cells that a wall runs through are occupied, those inside are free."""
+def room(rings: tuple[np.ndarray, ...] = RINGS) -> OccupancyGrid:
+    """A room as a grid: cells that a wall runs through are occupied, those inside are free."""
     frame = GridFrame(CELL, (-1.5, -0.5), (120, 180))
     occupied = np.zeros(frame.shape, dtype=bool)
-    for start, end in segments():
+    for start, end in segments(rings):
         steps = int(np.ceil(np.linalg.norm(end - start) / 0.01)) + 1
         cells = frame.cells(np.linspace(start, end, steps))
         occupied[cells[:, 0], cells[:, 1]] = True
     centres = frame.centres(np.moveaxis(np.indices(frame.shape), 0, -1))
-    inside = _inside(centres, OUTLINE) & ~_inside(centres, PILLAR)
+    inside = _inside(centres, rings[0])
+    for pillar in rings[1:]:
+        inside &= ~_inside(centres, pillar)
     return OccupancyGrid(frame, occupied, inside & ~occupied)
 
 
@@ -46,9 +50,11 @@ def _inside(points: np.ndarray, ring: np.ndarray) -> np.ndarray:
     return inside
 
 
-def exact_ranges(origin: np.ndarray, bearing: np.ndarray) -> np.ndarray:
+def exact_ranges(
+    origin: np.ndarray, bearing: np.ndarray, rings: tuple[np.ndarray, ...] = RINGS
+) -> np.ndarray:
     """Distance from points (R, 2) along bearings (R,) to the nearest wall, by line intersection."""
-    walls = segments()
+    walls = segments(rings)
     direction = np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)[:, None, :]
     along = (walls[:, 1] - walls[:, 0])[None]
     offset = walls[None, :, 0] - origin[:, None, :]
@@ -82,7 +88,12 @@ BACK = Mount.planar(-0.2, 0.05, 0.3, np.pi)
 
 
 def laser_scans(
-    truth: Trajectory, mounts: list[Mount], *, rate_hz: float = 20.0, beams: int = 361
+    truth: Trajectory,
+    mounts: list[Mount],
+    *,
+    rate_hz: float = 20.0,
+    beams: int = 361,
+    rings: tuple[np.ndarray, ...] = RINGS,
 ) -> list[LaserScan]:
     """Noise-free sweeps of 270 degrees, every ray cast from where the robot is at its time."""
     bearing = np.linspace(-2.356, 2.356, beams)
@@ -94,6 +105,6 @@ def laser_scans(
             at = time_ns + np.rint(np.arange(beams) * interval).astype(np.int64)
             sensor = np.array([*mount.translation_m[:2], mount.yaw_rad])
             pose = composed(truth.at(at), sensor)
-            ranges = exact_ranges(pose[:, :2], pose[:, 2] + bearing)
+            ranges = exact_ranges(pose[:, :2], pose[:, 2] + bearing, rings)
             scans.append(LaserScan(time_ns, interval, bearing, ranges, 30.0, mount, scanner))
     return sorted(scans, key=lambda scan: scan.time_ns)

@@ -24,9 +24,6 @@ CANDIDATES = 1200
 MODES = 40
 SCORE_MARGIN = 0.25
 """A pose whose score is this much (of 1) below the best is no hypothesis."""
-NEARBY_M = np.linspace(-0.3, 0.3, 7)
-NEARBY_RAD = np.radians(np.linspace(-25.0, 25.0, 21))
-"""Window of a search about a guess."""
 CLEARANCE_M = 0.15
 """The base stands at least this far from every wall."""
 
@@ -51,47 +48,21 @@ def start_hypotheses(room: OccupancyGrid, rays: Rays) -> tuple[FloatArray, Float
     places = _places(room, distance)
     if len(places) == 0 or len(rays) == 0:
         return np.empty((0, 3)), np.empty(0)
+    points = rays.end_m.astype(np.float32)
     heading = np.linspace(-np.pi, np.pi, COARSE_HEADINGS, endpoint=False)
     place_of = (np.array(room.frame.origin_m), room.frame.resolution_m)
-    blurred = _nearness_to_wall(distance, COARSE_SIGMA_M)
-    coarse = _place_scores(blurred, *place_of, places, heading, rays.end_m)
+    blurred = nearness_to_wall(distance, COARSE_SIGMA_M)
+    coarse = _place_scores(blurred, *place_of, places, heading, points)
     best = np.argsort(coarse, axis=None)[::-1][:CANDIDATES]
     place, turn = np.unravel_index(best, coarse.shape)
     pose = np.column_stack([places[place], heading[turn]])
-    sharper = _nearness_to_wall(distance, FINE_SIGMA_M)
+    sharper = nearness_to_wall(distance, FINE_SIGMA_M)
     for step_m in (0.1, 0.05, 0.025):
-        pose, score = _climbed((sharper, *place_of), pose, rays.end_m, step_m)
+        pose, score = _climbed((sharper, *place_of), pose, points, step_m)
     return _separate_modes(pose, score)
 
 
-class NearbySearch:
-    """Looks for the pose that fits a scan best within a window about a guess.
-
-    For runs whose scans lie far apart, or whose odometry is worse than the particle filter was
-    told: a local fit would not find its way back from such a guess.
-    """
-
-    def __init__(self, room: OccupancyGrid) -> None:
-        resolution = room.frame.resolution_m
-        distance = room.clearance_cells * np.float32(resolution)
-        self._grid = (
-            _nearness_to_wall(distance, FINE_SIGMA_M),
-            np.array(room.frame.origin_m),
-            resolution,
-        )
-        axes = (NEARBY_M, NEARBY_M, NEARBY_RAD)
-        self._window = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-
-    def best(self, pose: FloatArray, rays: Rays) -> FloatArray:
-        """The best pose of the window about ``pose``, shape (3,), and then of finer steps."""
-        score = _pose_scores(*self._grid, pose + self._window, rays.end_m)
-        found = (pose + self._window)[[int(np.argmax(score))]]
-        for step_m in (0.05, 0.025):
-            found, _ = _climbed(self._grid, found, rays.end_m, step_m)
-        return found[0]
-
-
-def _nearness_to_wall(distance: NDArray[np.float32], sigma_m: float) -> NDArray[np.float32]:
+def nearness_to_wall(distance: NDArray[np.float32], sigma_m: float) -> NDArray[np.float32]:
     """1 on a wall, falling as a Gaussian of width ``sigma_m`` away from it."""
     return np.exp(-0.5 * (distance / np.float32(sigma_m)) ** 2)
 
@@ -112,7 +83,7 @@ def _places(room: OccupancyGrid, distance: NDArray[np.float32]) -> FloatArray:
 def _climbed(
     grid: tuple[NDArray[np.float32], FloatArray, float],
     pose: FloatArray,
-    points: FloatArray,
+    points: NDArray[np.float32],
     step_m: float,
 ) -> tuple[FloatArray, FloatArray]:
     """Each pose moved to the best of its 27 neighbours, and the score there."""
@@ -142,19 +113,17 @@ def _separate_modes(pose: FloatArray, score: FloatArray) -> tuple[FloatArray, Fl
 
 
 @njit(cache=True, nogil=True)
-def _score(
+def pose_score(
     nearness: NDArray[np.float32],
     origin: FloatArray,
     resolution: float,
-    x: float,
-    y: float,
-    heading: float,
-    points: FloatArray,
+    pose: FloatArray,
+    points: NDArray[np.float32],
 ) -> float:
     """Mean nearness to a wall of the points, seen from one pose."""
     rows, columns = nearness.shape
-    cos, sin = np.cos(heading) / resolution, np.sin(heading) / resolution
-    start_x, start_y = (x - origin[0]) / resolution, (y - origin[1]) / resolution
+    cos, sin = np.cos(pose[2]) / resolution, np.sin(pose[2]) / resolution
+    start_x, start_y = (pose[0] - origin[0]) / resolution, (pose[1] - origin[1]) / resolution
     total = 0.0
     for point in range(len(points)):
         column = start_x + cos * points[point, 0] - sin * points[point, 1]
@@ -171,13 +140,14 @@ def _place_scores(
     resolution: float,
     places: FloatArray,
     heading: FloatArray,
-    points: FloatArray,
+    points: NDArray[np.float32],
 ) -> FloatArray:
     score = np.empty((len(places), len(heading)))
     for place in prange(len(places)):
-        x, y = places[place]
+        pose = np.array([places[place, 0], places[place, 1], 0.0])
         for turn in range(len(heading)):
-            score[place, turn] = _score(nearness, origin, resolution, x, y, heading[turn], points)
+            pose[2] = heading[turn]
+            score[place, turn] = pose_score(nearness, origin, resolution, pose, points)
     return score
 
 
@@ -187,10 +157,9 @@ def _pose_scores(
     origin: FloatArray,
     resolution: float,
     pose: FloatArray,
-    points: FloatArray,
+    points: NDArray[np.float32],
 ) -> FloatArray:
     score = np.empty(len(pose))
     for index in prange(len(pose)):
-        x, y, heading = pose[index]
-        score[index] = _score(nearness, origin, resolution, x, y, heading, points)
+        score[index] = pose_score(nearness, origin, resolution, pose[index], points)
     return score

@@ -19,9 +19,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from soundmap.deskew import Rays
-from soundmap.geometry import FloatArray, composed, transformed
+from soundmap.geometry import FloatArray
 from soundmap.grid import OccupancyGrid
-from soundmap.raycast import cast_ranges, walked_range
+from soundmap.raycast import walked_range
 
 
 @dataclass(frozen=True)
@@ -100,62 +100,6 @@ def beam_log_likelihood(
         + model.random_weight / model.range_max_m
     )
     return np.log(density)
-
-
-@dataclass(frozen=True)
-class Agreement:
-    """How a scan's returns compare with the map, as seen from one pose.
-
-    Attributes
-    ----------
-    is_matched : ndarray of bool, shape (B,)
-        Which returns lie where the map shows a surface.
-    beyond : float
-        Share that lies behind a surface of the map: things may stand before a wall that the map
-        lacks, but no ray passes through a wall that is there.
-    """
-
-    is_matched: NDArray[np.bool_]
-    beyond: float
-
-    @property
-    def matched(self) -> float:
-        """Share of the returns that lie where the map shows a surface."""
-        return float(self.is_matched.mean()) if len(self.is_matched) else 0.0
-
-
-def scan_agreement(
-    room: OccupancyGrid, pose: FloatArray, rays: Rays, *, tolerance_m: float
-) -> Agreement:
-    """What the map explains of a scan, and what contradicts it, seen from ``pose``, shape (3,).
-
-    ``tolerance_m`` is the greatest difference between measured and cast range of a match [m].
-    """
-    if len(rays) == 0:
-        return Agreement(np.zeros(0, dtype=bool), 0.0)
-    origins = transformed(pose, rays.origin_m)
-    bearings = rays.bearing_rad + pose[2]
-    measured = rays.range_m
-    limit = float(measured.max()) + 10.0 * tolerance_m
-    expected = cast_ranges(room, origins, bearings, range_max_m=limit)
-    # Where the map's surface is grazed, the range says little: look around the end point as well.
-    near = _near_occupied(room, composed(pose, _as_poses(rays.end_m))[:, :2])
-    matched = (np.abs(measured - expected) < tolerance_m) | near
-    beyond = ~matched & (measured > expected)
-    return Agreement(matched, float(beyond.mean()))
-
-
-def _as_poses(points: FloatArray) -> FloatArray:
-    return np.concatenate([points, np.zeros((len(points), 1))], axis=1)
-
-
-def _near_occupied(room: OccupancyGrid, points: FloatArray) -> NDArray[np.bool_]:
-    """Whether the cell of each point, or one of its eight neighbours, is occupied."""
-    offsets = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2)
-    cells = room.frame.cells(points)[:, None, :] + offsets
-    inside = room.frame.contains(cells)
-    row, column = np.where(inside, cells[..., 0], 0), np.where(inside, cells[..., 1], 0)
-    return np.any(inside & room.occupied[row, column], axis=1)
 
 
 @njit(cache=True, nogil=True)

@@ -50,7 +50,7 @@ def surface_field(room: OccupancyGrid) -> SurfaceField:
 def point_pull(
     field: SurfaceField,
     pose: FloatArray,
-    points_m: FloatArray,
+    points_m: NDArray[np.floating],
     first: NDArray[np.int64],
     share: FloatArray,
     *,
@@ -90,7 +90,7 @@ def point_pull(
         field.origin_m,
         field.resolution_m,
         np.ascontiguousarray(pose),
-        np.ascontiguousarray(points_m),
+        np.ascontiguousarray(points_m, dtype=np.float32),
         first,
         share,
         sigma_m,
@@ -104,38 +104,81 @@ def _point_pull(
     origin: FloatArray,
     resolution: float,
     pose: FloatArray,
-    points: FloatArray,
+    points: NDArray[np.float32],
     first: NDArray[np.int64],
     share: FloatArray,
     sigma: float,
     kernel: float,
 ) -> tuple[FloatArray, FloatArray]:
-    rows, columns = distance.shape
     information = np.zeros((len(pose), 3, 3))
     pull = np.zeros((len(pose), 3))
-    jacobian = np.empty(3)
     for k in range(len(pose)):
-        cos, sin = np.cos(pose[k, 2]), np.sin(pose[k, 2])
-        for i in range(first[k], first[k + 1]):
-            turned_x = cos * points[i, 0] - sin * points[i, 1]
-            turned_y = sin * points[i, 0] + cos * points[i, 1]
-            u = (pose[k, 0] + turned_x - origin[0]) / resolution
-            v = (pose[k, 1] + turned_y - origin[1]) / resolution
-            if not (0.0 <= u < columns - 1 and 0.0 <= v < rows - 1):
-                continue
-            column, row = int(u), int(v)
-            a, b = u - column, v - row
-            d00, d01 = distance[row, column], distance[row, column + 1]
-            d10, d11 = distance[row + 1, column], distance[row + 1, column + 1]
-            off = (1 - b) * ((1 - a) * d00 + a * d01) + b * ((1 - a) * d10 + a * d11)
-            if off > 3.0 * kernel:
-                continue
-            jacobian[0] = ((1 - b) * (d01 - d00) + b * (d11 - d10)) / resolution
-            jacobian[1] = ((1 - a) * (d10 - d00) + a * (d11 - d01)) / resolution
-            jacobian[2] = jacobian[1] * turned_x - jacobian[0] * turned_y
-            weight = share[i] * np.exp(-0.5 * (off / kernel) ** 2) / (sigma * sigma)
-            for m in range(3):
-                pull[k, m] -= weight * jacobian[m] * off
-                for n in range(3):
-                    information[k, m, n] += weight * jacobian[m] * jacobian[n]
+        own = slice(first[k], first[k + 1])
+        add_map_pull(
+            information[k],
+            pull[k],
+            distance,
+            origin,
+            resolution,
+            pose[k],
+            points[own],
+            share[own],
+            sigma,
+            kernel,
+        )
     return information, pull
+
+
+@njit(cache=True, nogil=True)
+def add_map_pull(
+    information: FloatArray,
+    pull: FloatArray,
+    distance: NDArray[np.float32],
+    origin: FloatArray,
+    resolution: float,
+    pose: FloatArray,
+    points: NDArray[np.float32],
+    share: FloatArray,
+    sigma: float,
+    kernel: float,
+) -> None:
+    """Add the normal equations of one pose to ``information`` (3, 3) and ``pull`` (3,)."""
+    rows, columns = distance.shape
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    for i in range(len(points)):
+        lever_x = cos * points[i, 0] - sin * points[i, 1]
+        lever_y = sin * points[i, 0] + cos * points[i, 1]
+        u = (pose[0] + lever_x - origin[0]) / resolution
+        v = (pose[1] + lever_y - origin[1]) / resolution
+        if not (0.0 <= u < columns - 1 and 0.0 <= v < rows - 1):
+            continue
+        column, row = int(u), int(v)
+        a, b = u - column, v - row
+        d00, d01 = distance[row, column], distance[row, column + 1]
+        d10, d11 = distance[row + 1, column], distance[row + 1, column + 1]
+        off = (1 - b) * ((1 - a) * d00 + a * d01) + b * ((1 - a) * d10 + a * d11)
+        if off > 3.0 * kernel:
+            continue
+        slope_x = ((1 - b) * (d01 - d00) + b * (d11 - d10)) / resolution
+        slope_y = ((1 - a) * (d10 - d00) + a * (d11 - d01)) / resolution
+        weight = share[i] * np.exp(-0.5 * (off / kernel) ** 2) / (sigma * sigma)
+        add_residual(information, pull, off, slope_x, slope_y, lever_x, lever_y, weight)
+
+
+@njit(cache=True, nogil=True)
+def add_residual(
+    information: FloatArray,
+    pull: FloatArray,
+    off: float,
+    slope_x: float,
+    slope_y: float,
+    lever_x: float,
+    lever_y: float,
+    weight: float,
+) -> None:
+    """Add one point: its residual, the slope of that, and where it lies from the base."""
+    jacobian = (slope_x, slope_y, slope_y * lever_x - slope_x * lever_y)
+    for m in range(3):
+        pull[m] -= weight * jacobian[m] * off
+        for n in range(3):
+            information[m, n] += weight * jacobian[m] * jacobian[n]

@@ -8,12 +8,7 @@ from soundmap.config import LocalizeConfig
 from soundmap.deskew import Rays
 from soundmap.geometry import FloatArray, wrapped_angle
 from soundmap.grid import OccupancyGrid
-from soundmap.localize.likelihood import (
-    Agreement,
-    BeamModel,
-    scan_agreement,
-    scan_log_likelihood,
-)
+from soundmap.localize.likelihood import BeamModel, scan_log_likelihood
 from soundmap.localize.motion import motion_noise, moved
 from soundmap.localize.particles import (
     Particles,
@@ -36,8 +31,8 @@ class ParticleFilter:
     Parameters
     ----------
     room : OccupancyGrid
-    hypotheses : ndarray, shape (K, 3)
-        Poses around which the particles start.
+    start : ndarray, shape (3,)
+        Pose around which the particles start.
     config : LocalizeConfig
     range_max_m : float
         :math:`z_{max}` of the scanners [m].
@@ -47,7 +42,7 @@ class ParticleFilter:
     def __init__(
         self,
         room: OccupancyGrid,
-        hypotheses: FloatArray,
+        start: FloatArray,
         config: LocalizeConfig,
         *,
         range_max_m: float,
@@ -63,9 +58,7 @@ class ParticleFilter:
             range_max_m,
         )
         self._noise = motion_noise(config)
-        count = config.particles if len(hypotheses) == 1 else config.global_particles
-        around = np.resize(hypotheses, (max(count, len(hypotheses)), 3))
-        pose = around + SEED_SIGMA * rng.standard_normal(around.shape)
+        pose = start + SEED_SIGMA * rng.standard_normal((config.particles, 3))
         pose[:, 2] = wrapped_angle(pose[:, 2])
         self._particles: Particles = equally_weighted(pose)
 
@@ -80,9 +73,7 @@ class ParticleFilter:
         exponent = self._config.likelihood_exponent
         self._particles = reweighted(self._particles, exponent * log_likelihood)
         if self._particles.effective_size < self._config.resample_share * len(self._particles):
-            settled = self.concentrated(self.estimate())
-            count = self._config.particles if settled else len(self._particles)
-            self._particles = resampled(self._particles, count, self._rng)
+            self._particles = resampled(self._particles, self._config.particles, self._rng)
 
     def estimate(self) -> PoseEstimate:
         """Weighted mean pose of the heaviest mode, with its spread."""
@@ -95,8 +86,3 @@ class ParticleFilter:
             and estimate.spread_m <= self._config.max_spread_m
             and estimate.spread_rad <= self._config.max_spread_rad
         )
-
-    def agreement(self, estimate: PoseEstimate, rays: Rays) -> Agreement:
-        """How a scan compares with the map from the estimated pose."""
-        tolerance = 3.0 * self._model.hit_sigma_m
-        return scan_agreement(self._room, estimate.pose, rays, tolerance_m=tolerance)

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from soundmap.geometry import FloatArray, composed, relative, wrapped_angle
@@ -105,14 +106,19 @@ def _solved(diagonal: FloatArray, coupling: FloatArray, right: FloatArray) -> Fl
     return solveh_banded(band, right.ravel(), lower=True).reshape(-1, 3)
 
 
+@njit(cache=True, nogil=True)
 def _marginal_covariance(diagonal: FloatArray, coupling: FloatArray) -> FloatArray:
     """Covariance of each pose, shape (K, 3, 3): the diagonal blocks of the system's inverse."""
     forward, backward = diagonal.copy(), diagonal.copy()
     for k in range(len(coupling)):
         forward[k + 1] -= coupling[k].T @ np.linalg.solve(forward[k], coupling[k])
     for k in range(len(coupling) - 1, -1, -1):
-        backward[k] -= coupling[k] @ np.linalg.solve(backward[k + 1], coupling[k].T)
-    return np.asarray(np.linalg.inv(forward + backward - diagonal), dtype=np.float64)
+        turned = np.ascontiguousarray(coupling[k].T)
+        backward[k] -= coupling[k] @ np.linalg.solve(backward[k + 1], turned)
+    covariance = np.empty(diagonal.shape)
+    for k in range(len(diagonal)):
+        covariance[k] = np.linalg.inv(forward[k] + backward[k] - diagonal[k])
+    return covariance
 
 
 def carried(pose: FloatArray, step: FloatArray, trusted: NDArray[np.bool_]) -> FloatArray:
@@ -129,12 +135,20 @@ def carried(pose: FloatArray, step: FloatArray, trusted: NDArray[np.bool_]) -> F
     known = np.flatnonzero(trusted)
     if len(known) == 0:
         return pose
-    odometry = np.zeros_like(pose)
-    for k in range(len(step)):
-        odometry[k + 1] = composed(odometry[k], step[k])
+    odometry = _chained(step)
     index = np.arange(len(pose))
     right = np.searchsorted(known, index).clip(0, len(known) - 1)
     left = (np.searchsorted(known, index, side="right") - 1).clip(0, len(known) - 1)
     nearer_left = np.abs(index - known[left]) <= np.abs(known[right] - index)
     anchor = np.where(nearer_left, known[left], known[right])
     return composed(pose[anchor], relative(odometry[anchor], odometry))
+
+
+def _chained(step: FloatArray) -> FloatArray:
+    """Poses to which steps lead from the origin, shape (K, 3) from (K - 1, 3)."""
+    heading = np.concatenate([[0.0], np.cumsum(step[:, 2])])
+    cos, sin = np.cos(heading[:-1]), np.sin(heading[:-1])
+    ahead_x = np.cumsum(cos * step[:, 0] - sin * step[:, 1])
+    ahead_y = np.cumsum(sin * step[:, 0] + cos * step[:, 1])
+    x, y = np.concatenate([[0.0], ahead_x]), np.concatenate([[0.0], ahead_y])
+    return np.stack([x, y, wrapped_angle(heading)], axis=-1)

@@ -7,17 +7,20 @@ whole scan, and later only shows that the pose still holds.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from soundmap.config import LocalizeConfig
-from soundmap.deskew import Rays, deskewed_rays
+from soundmap.deskew import Rays, deskewed_rays, interpolated_pose
 from soundmap.errors import NothingUsableError
 from soundmap.geometry import FloatArray, Trajectory, relative, transformed
 from soundmap.losses import LossLedger
 from soundmap.sensors import LaserScan
+from soundmap.standstill import StandstillWitness, compared_ranges, has_moved
 
 STAGE = "localize"
 LEAST_RAYS = 10
@@ -29,55 +32,210 @@ AT_REST = 0.2
 
 
 @dataclass(frozen=True)
-class View:
-    """One laser scan used: what was seen, and where the odometry thought the robot was.
+class Views:
+    """The laser scans used of a run, by time: what was seen, and where odometry put the robot.
 
     Attributes
     ----------
-    rays : Rays
-        In the base frame at their own time.
-    odometry : ndarray, shape (3,)
-        Base in the odometry frame at that time.
-    driven_m : float
+    time_ns : ndarray of int64, shape (K,)
+        Not decreasing [ns since epoch].
+    odometry : ndarray, shape (K, 3)
+        Base in the odometry frame at these times.
+    driven_m : ndarray, shape (K,)
         Distance driven up to then [m].
-    is_evidence : bool
+    is_evidence : ndarray of bool, shape (K,)
         Whether the view says something new about the pose.
-    scanner : int
+    scanner : ndarray of int64, shape (K,)
     range_max_m : float
-        Greatest range of the scanner [m].
+        Greatest range of any scanner [m].
+    first : ndarray of int64, shape (K + 1,)
+        View k has the rays first[k] to first[k + 1].
+    origin_m, end_m : ndarray of float32, shapes (P, 2)
+        Where the rays started and met a surface, in the base frame at their view's time [m].
     """
 
-    rays: Rays
+    time_ns: NDArray[np.int64]
     odometry: FloatArray
-    driven_m: float
-    is_evidence: bool
-    scanner: int
+    driven_m: FloatArray
+    is_evidence: NDArray[np.bool_]
+    scanner: NDArray[np.int64]
     range_max_m: float
+    first: NDArray[np.int64]
+    origin_m: NDArray[np.float32]
+    end_m: NDArray[np.float32]
 
-    @property
-    def time_ns(self) -> int:
-        """Time of the view [ns since epoch]."""
-        return self.rays.time_ns
+    def __len__(self) -> int:
+        return len(self.time_ns)
 
-    def without_rays(self) -> View:
-        """The same view with nothing seen."""
-        nothing = np.empty((0, 2))
-        return replace(self, rays=Rays(self.time_ns, nothing, nothing))
+    def rays(self, view: int) -> Rays:
+        """The rays of one view."""
+        own = slice(self.first[view], self.first[view + 1])
+        return Rays(
+            int(self.time_ns[view]),
+            self.origin_m[own].astype(np.float64),
+            self.end_m[own].astype(np.float64),
+        )
+
+    def joined_rays(self, views: Iterable[int], reference: int) -> Rays:
+        """The rays of several views in the base frame of one, as odometry puts them together."""
+        origins, ends = [], []
+        for view in views:
+            motion = relative(self.odometry[reference], self.odometry[view])
+            rays = self.rays(view)
+            origins.append(transformed(motion, rays.origin_m))
+            ends.append(transformed(motion, rays.end_m))
+        time_ns = int(self.time_ns[reference])
+        return Rays(time_ns, np.concatenate(origins), np.concatenate(ends))
+
+
+@dataclass(frozen=True)
+class _View:
+    """One of the views to be kept, with its rays in single precision."""
+
+    time_ns: int
+    scanner: int
+    is_evidence: bool
+    origin_m: NDArray[np.float32]
+    end_m: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class _Place:
-    """Where a scanner last looked from, how often, and when last."""
+    """Where a scanner last looked from, how often, when last, and what it saw then."""
 
-    odometry: FloatArray
+    x_m: float
+    y_m: float
+    heading_rad: float
     looks: int
     time_ns: int
+    ranges: FloatArray
+
+
+class ViewChooser:
+    """Takes the laser scans of a run one by one and keeps those worth using, deskewed.
+
+    Parameters
+    ----------
+    odometry : Trajectory
+    config : LocalizeConfig
+    losses : LossLedger
+        Where scans that could not be used are counted.
+    """
+
+    def __init__(self, odometry: Trajectory, config: LocalizeConfig, losses: LossLedger) -> None:
+        self._odometry, self._config, self._losses = odometry, config, losses
+        self._most_looks = math.ceil(1.0 / config.likelihood_exponent)
+        self._witness = StandstillWitness(odometry)
+        self._places: dict[int, _Place] = {}
+        self._passed_over: dict[int, LaserScan] = {}
+        self._range_max_m = 0.0
+        self._chosen: list[_View] = []
+
+    def see(self, scan: LaserScan) -> None:
+        """Look at one more scan; scans come by time.
+
+        Raises
+        ------
+        NothingUsableError
+            The odometry stands still while the scans change.
+        """
+        time_ns = scan.middle_ns
+        x, y, heading = interpolated_pose(self._odometry.time_ns, self._odometry.pose, time_ns)
+        if math.isnan(x):
+            self._losses.add("laser scan without odometry", STAGE, effect="scan not used")
+            return
+        place = self._places.get(scan.scanner)
+        looks = 0
+        if place is not None:
+            way = self._way(place, x, y, heading)
+            elapsed_s = (time_ns - place.time_ns) * 1e-9
+            if way < 1.0 and not self._is_due(place, way, elapsed_s, scan):
+                self._passed_over[scan.scanner] = scan
+                return
+            stands = way < 1.0 and not (way < AT_REST and self._looks_elsewhere(place, scan))
+            looks = place.looks if stands else 0
+        view = self._view(scan, time_ns, is_evidence=looks < self._most_looks)
+        if len(view.end_m) < LEAST_RAYS:
+            self._losses.add("laser scan with too few returns", STAGE, effect="scan not used")
+            return
+        self._passed_over.pop(scan.scanner, None)
+        if place is not None and looks > 0:
+            self._places[scan.scanner] = replace(place, looks=looks + 1, time_ns=time_ns)
+        else:
+            self._places[scan.scanner] = _Place(x, y, heading, 1, time_ns, compared_ranges(scan))
+        self._witness.see(scan)
+        self._range_max_m = max(self._range_max_m, scan.range_max_m)
+        self._chosen.append(view)
+
+    def views(self) -> Views:
+        """What was chosen; among it the first and the last scan of every scanner.
+
+        Raises
+        ------
+        NothingUsableError
+            No scan has enough returns within the time of the odometry.
+        """
+        if not self._chosen:
+            raise NothingUsableError(
+                "no laser scan has enough returns at a time that the odometry spans; the robot "
+                "cannot be localized. `soundmap info` shows what the log holds."
+            )
+        last = [
+            self._view(scan, scan.middle_ns, is_evidence=False)
+            for scan in self._passed_over.values()
+        ]
+        chosen = sorted([*self._chosen, *last], key=lambda view: view.time_ns)
+        time_ns = np.array([view.time_ns for view in chosen], dtype=np.int64)
+        driven_m = self._odometry.driven_m()
+        return Views(
+            time_ns=time_ns,
+            odometry=self._odometry.at(time_ns),
+            driven_m=np.interp(time_ns, self._odometry.time_ns, driven_m),
+            is_evidence=np.array([view.is_evidence for view in chosen]),
+            scanner=np.array([view.scanner for view in chosen], dtype=np.int64),
+            range_max_m=self._range_max_m,
+            first=np.cumsum([0, *(len(view.end_m) for view in chosen)], dtype=np.int64),
+            origin_m=np.concatenate([view.origin_m for view in chosen]),
+            end_m=np.concatenate([view.end_m for view in chosen]),
+        )
+
+    def _way(self, place: _Place, x_m: float, y_m: float, heading_rad: float) -> float:
+        """Motion since the scanner's last place, 1 where it makes a new one."""
+        moved_m = math.hypot(x_m - place.x_m, y_m - place.y_m)
+        turned_rad = abs(math.remainder(heading_rad - place.heading_rad, 2.0 * math.pi))
+        return max(
+            moved_m / max(self._config.update_distance_m, 1e-9),
+            turned_rad / max(self._config.update_angle_rad, 1e-9),
+        )
+
+    def _is_due(self, place: _Place, way: float, elapsed_s: float, scan: LaserScan) -> bool:
+        """Whether it is time for another look from about the same place."""
+        if elapsed_s >= self._config.update_interval_s:
+            return True
+        if way >= AT_REST or elapsed_s < LOOK_INTERVAL_S:
+            return False
+        return place.looks < self._most_looks or self._looks_elsewhere(place, scan)
+
+    @staticmethod
+    def _looks_elsewhere(place: _Place, scan: LaserScan) -> bool:
+        """Whether the robot has moved unnoticed by its odometry."""
+        return has_moved(place.ranges, compared_ranges(scan))
+
+    def _view(self, scan: LaserScan, time_ns: int, *, is_evidence: bool) -> _View:
+        rays = deskewed_rays(scan, self._odometry, time_ns, most=self._config.beams)
+        return _View(
+            time_ns,
+            scan.scanner,
+            is_evidence,
+            rays.origin_m.astype(np.float32),
+            rays.end_m.astype(np.float32),
+        )
 
 
 def chosen_views(
     lasers: Iterable[LaserScan], odometry: Trajectory, config: LocalizeConfig, losses: LossLedger
-) -> Iterator[View]:
-    """The scans worth using, deskewed; among them the first and the last of every scanner.
+) -> Views:
+    """The scans worth using of a whole run, ordered by time.
 
     Raises
     ------
@@ -85,106 +243,7 @@ def chosen_views(
         No scan has enough returns within the time of the odometry, or the odometry stands still
         while the scans change.
     """
-    places: dict[int, _Place] = {}
-    passed_over: dict[int, LaserScan] = {}
-    witness, eye = _StandstillWitness(odometry), _Eye(odometry, config)
+    chooser = ViewChooser(odometry, config, losses)
     for scan in lasers:
-        position = odometry.at(scan.middle_ns)
-        if not np.isfinite(position).all():
-            losses.add("laser scan without odometry", STAGE, effect="scan not used")
-            continue
-        earlier = places.get(scan.scanner)
-        looks = eye.looks_here(earlier, position)
-        if earlier is not None and not eye.is_due(earlier, position, scan.middle_ns):
-            passed_over[scan.scanner] = scan
-            continue
-        view = eye.view(scan, is_evidence=looks < eye.most_looks)
-        if len(view.rays) < LEAST_RAYS:
-            losses.add("laser scan with too few returns", STAGE, effect="scan not used")
-            continue
-        passed_over.pop(scan.scanner, None)
-        from_here = position if looks == 0 or earlier is None else earlier.odometry
-        places[scan.scanner] = _Place(from_here, looks + 1, scan.middle_ns)
-        witness.see(scan)
-        yield view
-    if not places:
-        raise NothingUsableError(
-            "no laser scan has enough returns at a time that the odometry spans; the robot cannot "
-            "be localized. `soundmap info` shows what the log holds."
-        )
-    for scan in sorted(passed_over.values(), key=lambda scan: scan.middle_ns):
-        yield eye.view(scan, is_evidence=False)
-
-
-def joined_rays(views: Iterable[View], reference: View) -> Rays:
-    """The rays of several views in the base frame of one of them."""
-    origins, ends = [], []
-    for view in views:
-        motion = relative(reference.odometry, view.odometry)
-        origins.append(transformed(motion, view.rays.origin_m))
-        ends.append(transformed(motion, view.rays.end_m))
-    return Rays(reference.time_ns, np.concatenate(origins), np.concatenate(ends))
-
-
-class _Eye:
-    """Judges laser scans along one odometry, and turns them into views."""
-
-    def __init__(self, odometry: Trajectory, config: LocalizeConfig) -> None:
-        self._odometry, self._config = odometry, config
-        self._driven_m = odometry.driven_m()
-        self.most_looks = int(np.ceil(1.0 / config.likelihood_exponent))
-
-    def looks_here(self, earlier: _Place | None, position: FloatArray) -> int:
-        """How often the scanner has looked from this place already."""
-        return 0 if earlier is None or self._way(earlier, position) >= 1.0 else earlier.looks
-
-    def is_due(self, earlier: _Place, position: FloatArray, time_ns: int) -> bool:
-        """Whether it is time for the scanner's next view."""
-        way = self._way(earlier, position)
-        at_rest = way < AT_REST and earlier.looks < self.most_looks
-        interval_s = LOOK_INTERVAL_S if at_rest else self._config.update_interval_s
-        return way >= 1.0 or (time_ns - earlier.time_ns) * 1e-9 >= interval_s
-
-    def _way(self, earlier: _Place, position: FloatArray) -> float:
-        """Motion since the scanner's last place, 1 where it makes a new one."""
-        step = relative(earlier.odometry, position)
-        moved = np.hypot(step[0], step[1]) / max(self._config.update_distance_m, 1e-9)
-        return float(max(moved, abs(step[2]) / max(self._config.update_angle_rad, 1e-9)))
-
-    def view(self, scan: LaserScan, *, is_evidence: bool) -> View:
-        time_ns = scan.middle_ns
-        return View(
-            rays=deskewed_rays(scan, self._odometry, time_ns, most=self._config.beams),
-            odometry=self._odometry.at(time_ns),
-            driven_m=float(np.interp(time_ns, self._odometry.time_ns, self._driven_m)),
-            is_evidence=is_evidence,
-            scanner=scan.scanner,
-            range_max_m=scan.range_max_m,
-        )
-
-
-class _StandstillWitness:
-    """Notices odometry that stands still while the laser scans show that the robot moves."""
-
-    def __init__(self, odometry: Trajectory) -> None:
-        step = relative(odometry.pose[:-1], odometry.pose[1:])
-        driven_m = np.hypot(step[:, 0], step[:, 1]).sum()
-        turned_rad = np.abs(step[:, 2]).sum()
-        self._stuck = bool(driven_m < 0.02 and turned_rad < np.radians(2.0))
-        self._first: dict[int, FloatArray] = {}
-        self._changed = 0
-
-    def see(self, scan: LaserScan) -> None:
-        if not self._stuck:
-            return
-        first = self._first.setdefault(scan.scanner, scan.range_m)
-        if len(first) != len(scan.range_m):
-            return
-        both = np.isfinite(first) & np.isfinite(scan.range_m)
-        moved_share = np.mean(np.abs(first[both] - scan.range_m[both]) > 0.1) if both.any() else 0.0
-        self._changed = self._changed + 1 if moved_share > 0.3 else 0
-        if self._changed >= 3:
-            raise NothingUsableError(
-                "the odometry never moves although the laser scans show that the robot does. "
-                "Check the odometry topic ([topics] odometry); `soundmap info` lists them."
-            )
+        chooser.see(scan)
+    return chooser.views()

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from soundmap.config import LocalizeConfig
 from soundmap.geometry import FloatArray, transformed
 from soundmap.grid import OccupancyGrid
 from soundmap.localize.map_fit import point_pull, surface_field
 from soundmap.localize.smoothing import ScanEvidence
+from soundmap.localize.views import Views
 from soundmap.localize.wall_lines import has_line, line_pull, surface_cells, wall_lines
 
 KERNEL_M = 0.15
@@ -29,40 +31,40 @@ class WallFit:
         self._sigma_m, self._independence = config.hit_sigma_m, config.likelihood_exponent
 
     def evidence(
-        self, points_m: list[FloatArray], pose: FloatArray, *, by_lines: bool
+        self, views: Views, counts: NDArray[np.bool_], pose: FloatArray, *, by_lines: bool
     ) -> ScanEvidence:
-        """Information and pull of the points on any poses.
+        """Information and pull of the returns of all views on any poses.
 
         Parameters
         ----------
-        points_m : list of ndarray, shapes (P_k, 2)
-            Returns that count, in the base frame of each pose [m].
+        views : Views
+        counts : ndarray of bool, shape (P,)
+            Which returns count.
         pose : ndarray, shape (K, 3)
             Best poses so far: lines are drawn from there.
         by_lines : bool
             Fit to lines as well as to cells.
         """
-        first = np.concatenate([[0], np.cumsum([len(points) for points in points_m])])
-        first, flat = first.astype(np.int64), np.concatenate(points_m)
+        points_m = views.end_m[counts]
+        first = np.concatenate([[0], np.cumsum(counts)])[views.first].astype(np.int64)
         sigma_m, weight = self._sigma_m, self._independence
-
-        share = np.ones(len(flat))
+        share = np.ones(len(points_m))
 
         def by_map(at: FloatArray) -> tuple[FloatArray, FloatArray]:
             information, pull = point_pull(
-                self._field, at, flat, first, share, sigma_m=sigma_m, kernel_m=KERNEL_M
+                self._field, at, points_m, first, share, sigma_m=sigma_m, kernel_m=KERNEL_M
             )
             return weight * information, weight * pull
 
         if not by_lines:
             return by_map
-        points = transformed(np.repeat(pose, np.diff(first), axis=0), flat)
+        points = transformed(np.repeat(pose, np.diff(first), axis=0), points_m)
         lines = wall_lines(self._surface, points)
         share[has_line(self._surface, lines, points)] = MAP_SHARE
 
         def by_both(at: FloatArray) -> tuple[FloatArray, FloatArray]:
             information, pull = line_pull(
-                self._surface, lines, at, flat, first, sigma_m=sigma_m, kernel_m=KERNEL_M
+                self._surface, lines, at, points_m, first, sigma_m=sigma_m, kernel_m=KERNEL_M
             )
             map_information, map_pull = by_map(at)
             return weight * information + map_information, weight * pull + map_pull

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from soundmap.geometry import FloatArray
 from soundmap.grid import OccupancyGrid
+from soundmap.localize.map_fit import add_residual
 
 REACH_M = 0.15
 """Returns farther than this from a surface cell do not belong to it."""
@@ -130,7 +131,7 @@ def line_pull(
     surface: SurfaceCells,
     lines: WallLines,
     pose: FloatArray,
-    points_m: FloatArray,
+    points_m: NDArray[np.floating],
     first: NDArray[np.int64],
     *,
     sigma_m: float,
@@ -148,7 +149,7 @@ def line_pull(
         lines.normal,
         lines.offset_m,
         np.ascontiguousarray(pose),
-        np.ascontiguousarray(points_m),
+        np.ascontiguousarray(points_m, dtype=np.float32),
         first,
         sigma_m,
         kernel_m,
@@ -208,7 +209,7 @@ def _line_pull(
     normal: FloatArray,
     offset: FloatArray,
     pose: FloatArray,
-    points: FloatArray,
+    points: NDArray[np.float32],
     first: NDArray[np.int64],
     sigma: float,
     kernel: float,
@@ -216,26 +217,21 @@ def _line_pull(
     rows, columns = nearest.shape
     information = np.zeros((len(pose), 3, 3))
     pull = np.zeros((len(pose), 3))
-    jacobian = np.empty(3)
     for k in range(len(pose)):
         cos, sin = np.cos(pose[k, 2]), np.sin(pose[k, 2])
         for i in range(first[k], first[k + 1]):
-            turned_x = cos * points[i, 0] - sin * points[i, 1]
-            turned_y = sin * points[i, 0] + cos * points[i, 1]
-            x, y = pose[k, 0] + turned_x, pose[k, 1] + turned_y
+            lever_x = cos * points[i, 0] - sin * points[i, 1]
+            lever_y = sin * points[i, 0] + cos * points[i, 1]
+            x, y = pose[k, 0] + lever_x, pose[k, 1] + lever_y
             column = int(np.floor((x - corner[0]) / resolution))
             row = int(np.floor((y - corner[1]) / resolution))
             if not (0 <= row < rows and 0 <= column < columns):
                 continue
             line = nearest[row, column]
-            off = normal[line, 0] * x + normal[line, 1] * y - offset[line]
-            if (normal[line, 0] == 0.0 and normal[line, 1] == 0.0) or abs(off) > 3.0 * kernel:
+            slope_x, slope_y = normal[line]
+            off = slope_x * x + slope_y * y - offset[line]
+            if (slope_x == 0.0 and slope_y == 0.0) or abs(off) > 3.0 * kernel:
                 continue
-            jacobian[0], jacobian[1] = normal[line, 0], normal[line, 1]
-            jacobian[2] = normal[line, 1] * turned_x - normal[line, 0] * turned_y
             weight = np.exp(-0.5 * (off / kernel) ** 2) / (sigma * sigma)
-            for m in range(3):
-                pull[k, m] -= weight * jacobian[m] * off
-                for n in range(3):
-                    information[k, m, n] += weight * jacobian[m] * jacobian[n]
+            add_residual(information[k], pull[k], off, slope_x, slope_y, lever_x, lever_y, weight)
     return information, pull

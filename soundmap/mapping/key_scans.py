@@ -19,6 +19,7 @@ from soundmap.geometry import FloatArray, Trajectory, relative, wrapped_angle
 from soundmap.losses import LossLedger
 from soundmap.mapping.surface_normals import surface_normals
 from soundmap.sensors import LaserScan
+from soundmap.standstill import StandstillWitness
 
 STAGE = "map"
 LEAST_RAYS = 20
@@ -33,10 +34,6 @@ BODY_LEAST_SCANS = 20
 BODY_LEAST_WAY_M = 2.0
 """... were taken over at least this way."""
 STRIP_M = 0.25
-STILL_M, STILL_RAD = 0.02, np.radians(2.0)
-"""Odometry that moves less than this in a whole run stands still."""
-CHANGE_M, CHANGED_SHARE, CHANGED_SCANS = 0.2, 0.4, 5
-"""The robot has moved if so many scans in turn differ from the first in such a share by so much."""
 
 Float32Array = NDArray[np.float32]
 
@@ -138,7 +135,7 @@ def chosen_key_scans(
     driven = odometry.driven_m()
     steps = np.abs(wrapped_angle(np.diff(odometry.pose[:, 2])))
     turned = np.concatenate([np.zeros(min(len(odometry), 1)), np.cumsum(steps)])
-    witness = _StandstillWitness(driven[-1:].sum() < STILL_M and turned[-1:].sum() < STILL_RAD)
+    witness = StandstillWitness(odometry)
     last: dict[int, FloatArray] = {}
     chosen: list[KeyScan] = []
     times: list[int] = []
@@ -177,32 +174,6 @@ def chosen_key_scans(
         "laser return from the robot itself", STAGE, effect="not used", count=body_returns
     )
     return KeyScans(tuple(masked), np.unique(np.array(times, dtype=np.int64)), body_returns)
-
-
-class _StandstillWitness:
-    """Notices odometry that stands still while the laser scans show that the robot moves."""
-
-    def __init__(self, stands_still: bool) -> None:
-        self._stands_still = stands_still
-        self._first: dict[int, FloatArray] = {}
-        self._changed = 0
-
-    def see(self, scan: LaserScan) -> None:
-        if not self._stands_still:
-            return
-        first = self._first.setdefault(scan.scanner, scan.range_m)
-        if first.shape != scan.range_m.shape:
-            return
-        change = np.abs(first - scan.range_m)
-        known = np.isfinite(change)
-        moved = bool(known.any() and np.mean(change[known] > CHANGE_M) > CHANGED_SHARE)
-        self._changed = self._changed + 1 if moved else 0
-        if self._changed >= CHANGED_SCANS:
-            raise NothingUsableError(
-                "the odometry never moves although the laser scans show that the robot does; no "
-                "map can be built. Check the odometry topic ([topics] odometry); `soundmap info` "
-                "lists them."
-            )
 
 
 def without_body(scans: list[KeyScan]) -> tuple[list[KeyScan], int]:

@@ -39,6 +39,8 @@ RUNS = ("run1", "run2", "run3")
 DIFFERENCES = {"run1-run3": ("run1", "run3"), "run2-run3": ("run2", "run3")}
 COLUMNS = {"paper.toml": (PAPER,), "default": ()}
 """Heading of the table, and the configuration files that come before the robot's own."""
+START = "1.0,1.2,0"
+"""Where the scene's robot starts: the corridor looks the same after every quarter turn."""
 TABLE_2 = {"run1": {"S1": 0.29, "S2": 0.22, "S3": 0.07}, "run2": {"S1": 0.11, "S3": 0.18}}
 """Errors [m] that the paper gives in its Table 2."""
 HEADING = "| | paper | paper.toml | default |\n|---|---|---|---|\n"
@@ -83,7 +85,7 @@ def results_of(logs: Path, files: Sequence[Path], out: Path) -> dict[str, tuple[
     judgements = {}
     for run in RUNS:
         log = logs / run / f"{run}.mcap"
-        way = ("--map", logs / run / "map.yaml", "--out", out / run)
+        way = ("--map", logs / run / "map.yaml", "--out", out / run, "--start-pose", START)
         program("process", log, *way, *settings, *quiet)
         truth = logs / run / "sources.csv"
         judgements[run] = judged(out / run, truth, logs / run / "trajectory.tum")

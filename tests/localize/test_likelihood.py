@@ -8,7 +8,6 @@ from soundmap.geometry import transformed
 from soundmap.localize.likelihood import (
     BeamModel,
     beam_log_likelihood,
-    scan_agreement,
     scan_log_likelihood,
 )
 from soundmap.raycast import cast_ranges
@@ -55,20 +54,3 @@ def test_the_true_pose_is_likelier_than_any_other_nearby():
     offsets = offsets.reshape(-1, 3)
     values = scan_log_likelihood(worlds.room(), pose + offsets, rays, MODEL)
     assert np.all(offsets[np.argmax(values)] == 0)
-
-
-def test_agreement_counts_what_the_map_explains_and_what_contradicts_it():
-    rays, pose = rays_at(20)
-    room = worlds.room()
-    right = scan_agreement(room, pose, rays, tolerance_m=0.15)
-    assert right.matched > 0.98
-    assert right.beyond < 0.02
-    wrong = scan_agreement(room, pose + np.array([0.8, 0.5, 0.7]), rays, tolerance_m=0.15)
-    assert wrong.matched < 0.5
-    assert wrong.beyond > 0.2
-    shortened = 1 - 0.4 * (np.arange(len(rays)) % 4 == 0)  # an obstacle before every fourth ray
-    end = rays.origin_m + (rays.end_m - rays.origin_m) * shortened[:, None]
-    blocked = type(rays)(rays.time_ns, rays.origin_m, end)
-    agreement = scan_agreement(room, pose, blocked, tolerance_m=0.15)
-    assert agreement.matched == pytest.approx(0.75, abs=0.03)
-    assert agreement.beyond == 0.0

@@ -210,6 +210,58 @@ class TestFaults:
         assert next(iter(losses)).what == "laser scan without odometry"
 
 
+def test_odometry_that_sticks_in_mid_run_does_not_lose_the_robot():
+    """For three seconds the wheels report nothing, in a straight and in a turn."""
+    for start_s in (4.0, 14.0):
+        time_s = (TRUTH.time_ns - TRUTH.time_ns[0]) * 1e-9
+        pose = odometry_of(TRUTH).pose
+        step = relative(pose[:-1], pose[1:])
+        step[(time_s[1:] > start_s) & (time_s[1:] < start_s + 3.0)] = 0.0
+        stuck = [np.zeros(3)]
+        for part in step:
+            stuck.append(composed(stuck[-1], part))
+        odometry = Trajectory(TRUTH.time_ns, np.array(stuck), TRUTH.usable)
+        estimate = estimate_trajectory(SCANS, odometry, ROOM, CONFIG)
+        position, _ = errors(estimate)
+        assert estimate.usable.mean() > 0.95
+        assert np.quantile(position[estimate.usable], 0.95) < 0.06
+        assert position[estimate.usable].max() < 0.15
+
+
+class TestPlacesThatLookAlike:
+    """A rectangular room without a mark is the same after half a turn."""
+
+    outline = np.array([[0.0, 0.0], [6.0, 0.0], [6.0, 4.0], [0.0, 4.0]]) + worlds.HALF
+    truth = worlds.driven([(1.0, 1.0), (5.0, 1.0), (5.0, 3.0), (2.0, 3.0)])
+
+    def scans(self, outline):
+        mounts = [worlds.FRONT, worlds.BACK]
+        return worlds.laser_scans(self.truth, mounts, rate_hz=10.0, rings=(outline,))
+
+    @pytest.mark.parametrize("smoothing", [True, False])
+    def test_the_program_says_that_it_cannot_tell(self, smoothing):
+        config = CONFIG.model_copy(update={"smoothing": smoothing})
+        odometry, room = odometry_of(self.truth), worlds.room((self.outline,))
+        with pytest.raises(MapError, match=r"looks alike in several places.*--start-pose"):
+            estimate_trajectory(self.scans(self.outline), odometry, room, config)
+
+    def test_a_start_pose_tells(self):
+        start = tuple(self.truth.pose[0] + [0.1, -0.1, 0.05])
+        odometry, room = odometry_of(self.truth), worlds.room((self.outline,))
+        estimate = estimate_trajectory(
+            self.scans(self.outline), odometry, room, CONFIG, start_pose=start
+        )
+        assert errors(estimate, self.truth)[0].max() < 0.06
+
+    def test_a_mark_tells(self):
+        niche = np.array([[0.0, 3.0], [-0.6, 3.0], [-0.6, 2.2], [0.0, 2.2]]) + worlds.HALF
+        outline = np.concatenate([self.outline, niche])
+        odometry, room = odometry_of(self.truth), worlds.room((outline,))
+        estimate = estimate_trajectory(self.scans(outline), odometry, room, CONFIG)
+        assert estimate.usable.mean() > 0.95
+        assert errors(estimate, self.truth)[0][estimate.usable].max() < 0.08
+
+
 def test_smoothing_brings_the_poses_nearer_to_the_truth():
     odometry = odometry_of(TRUTH, scale=1.03, turn_scale=0.98, drift_rad_per_m=np.radians(2.0))
     plain, smoothed = (

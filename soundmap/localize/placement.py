@@ -1,0 +1,198 @@
+"""Where each view was taken from: a start found or given, followed ahead and back; lost stretches.
+
+Where the views stop matching the map, the pose is sought anew, in the whole map and where odometry
+leads from both sides, and followed back into the stretch as well as ahead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soundmap.config import LocalizeConfig
+from soundmap.errors import MapError
+from soundmap.geometry import FloatArray, composed, relative
+from soundmap.grid import OccupancyGrid
+from soundmap.localize.following import Follower, Track
+from soundmap.localize.global_start import start_hypotheses
+from soundmap.localize.hypotheses import FIRST_SPAN, Followed, surviving
+from soundmap.localize.views import STAGE, Views
+from soundmap.losses import LossLedger
+
+FIRST_MATCH = 0.6
+"""Share of a view that must match before a pose that nothing else speaks for is believed."""
+MOST_BEYOND = 0.10
+"""Share of it that may lie behind the map's walls then."""
+ELSEWHERE_MATCH = 0.8
+"""Share that must match to believe that the robot is where odometry cannot have led."""
+ODOMETRY_DRIFT = 0.2
+"""Worst drift of any odometry in use [m/m and rad/m]."""
+SEARCH_EVERY_M = 3.0
+"""Way between two places from which the pose is sought in the whole map."""
+MOST_SEARCHES = 40
+TOGETHER_NS = 300_000_000
+"""Views this close together are matched to the map as one."""
+LOST_M, LOST_S = 1.0, 2.0
+"""Views that do not match over so much way, or time, make a lost stretch."""
+CANNOT_TELL = (
+    "the pose cannot be told from the laser scans: the map looks alike in several places, and the "
+    "whole run fits it from each of them. Give the start with --start-pose X,Y,DEG."
+)
+
+
+class Placement:
+    """Poses of all views of a run, as far as they could be found.
+
+    Parameters
+    ----------
+    room : OccupancyGrid
+    views : Views
+    config : LocalizeConfig
+    losses : LossLedger
+        Is told of lost stretches.
+
+    Attributes
+    ----------
+    pose : ndarray, shape (K, 3)
+    matched, beyond : ndarray, shape (K,)
+        As in `soundmap.localize.agreement.Agreement`.
+    is_cannot_tell : bool
+        Several places fit equally well.
+    """
+
+    def __init__(
+        self, room: OccupancyGrid, views: Views, config: LocalizeConfig, losses: LossLedger
+    ) -> None:
+        self._room, self._views, self._config, self._losses = room, views, config, losses
+        self._follower = Follower(
+            room,
+            views,
+            hit_sigma_m=config.hit_sigma_m,
+            weight=config.likelihood_exponent,
+            min_match=config.min_match,
+        )
+        count = len(views)
+        self.pose = np.zeros((count, 3))
+        self.matched, self.beyond = np.zeros(count), np.ones(count)
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Which views match the map from their poses, shape (K,)."""
+        return (self.matched >= self._config.min_match) & (self.beyond <= 0.5 * self.matched)
+
+    def find(self, start_pose: FloatArray | None) -> None:
+        """Place the whole run, from a given pose of the first view or from anywhere in the map.
+
+        Raises
+        ------
+        MapError
+            The map has no place for a robot, or it looks alike in several places.
+        """
+        everything = np.arange(len(self._views))
+        if start_pose is not None:
+            orders = [everything]
+            given = surviving(self._follower, orders, start_pose[None, :])
+            if self._is_proved(given[0], FIRST_MATCH):
+                self._spread(0, given[0].start, everything)
+            else:
+                self._remark()
+        if start_pose is None or not self.known.any():
+            for view in _search_places(self._views, everything):
+                if self._found(view, everything, edges={}):
+                    break
+        for stretch in _stretches(self._views, ~self.known):
+            if len(stretch) < len(everything):
+                self._find_again(stretch)
+
+    def _find_again(self, stretch: NDArray[np.int64]) -> None:
+        """Seek the pose in a stretch where it has been lost."""
+        self._remark()
+        edges = {
+            int(edge): self.pose[edge]
+            for edge in (stretch[0] - 1, stretch[-1] + 1)
+            if 0 <= edge < len(self._views)
+        }
+        for view in _search_places(self._views, stretch):
+            if not self.known[view]:
+                self._found(view, stretch, edges)
+
+    def _found(self, view: int, stretch: NDArray[np.int64], edges: dict[int, FloatArray]) -> bool:
+        """Seek the pose of one view; if it is found, place what can be followed from there."""
+        views = self._views
+        near = np.abs(views.time_ns[stretch] - views.time_ns[view]) < TOGETHER_NS
+        rays = views.joined_rays(stretch[near].tolist(), view)
+        hypotheses, _ = start_hypotheses(self._room, rays)
+        carried = [carried_pose(views, edge, pose, view) for edge, pose in edges.items()]
+        hypotheses = np.concatenate([hypotheses, np.array(carried).reshape(-1, 3)])
+        if len(hypotheses) == 0:
+            raise MapError("the map has no free space in which the robot could stand.")
+        ahead, back = stretch[stretch >= view], stretch[stretch <= view][::-1]
+        orders = sorted([ahead, back], key=len, reverse=True)
+        proved = []
+        for each in surviving(self._follower, orders, hypotheses):
+            expected = any(leads_to(views, edge, edges[edge], view, each.start) for edge in edges)
+            needed = FIRST_MATCH if expected or not edges else ELSEWHERE_MATCH
+            if self._is_proved(each, needed):
+                proved.append((each, expected))
+        likely = [each for each, expected in proved if expected] or [each for each, _ in proved]
+        if len(likely) > 1 and not edges:
+            raise MapError(CANNOT_TELL)
+        if len(likely) != 1:
+            return False
+        self._spread(view, likely[0].start, stretch)
+        return True
+
+    def _is_proved(self, followed: Followed, needed: float) -> bool:
+        first = slice(0, FIRST_SPAN)
+        matched, beyond = followed.track.matched[first], followed.track.beyond[first]
+        return bool(np.median(matched) >= needed and np.median(beyond) <= MOST_BEYOND)
+
+    def _spread(self, view: int, start: FloatArray, stretch: NDArray[np.int64]) -> None:
+        """Follow a pose through a stretch; views that match better than before take it."""
+        for order in (stretch[stretch >= view], stretch[stretch <= view][::-1]):
+            self._take(order, self._follower.followed(order, start, seek=True))
+
+    def _take(self, order: NDArray[np.int64], track: Track) -> None:
+        better = track.support > (self.matched - self.beyond)[order]
+        chosen = order[better]
+        self.pose[chosen] = track.pose[better]
+        self.matched[chosen], self.beyond[chosen] = track.matched[better], track.beyond[better]
+
+    def _remark(self) -> None:
+        self._losses.remark(
+            "laser scans stopped matching the map", STAGE, effect="pose sought in the whole map"
+        )
+
+
+def carried_pose(views: Views, known: int, pose: FloatArray, view: int) -> FloatArray:
+    """Where odometry leads from the pose of one view by the time of another, shape (3,)."""
+    return composed(pose, relative(views.odometry[known], views.odometry[view]))
+
+
+def leads_to(views: Views, known: int, pose: FloatArray, view: int, found: FloatArray) -> bool:
+    """Whether odometry can have led from the pose of one view to that found for another."""
+    off = relative(carried_pose(views, known, pose, view), found)
+    driven_m = abs(views.driven_m[view] - views.driven_m[known])
+    near = np.hypot(off[0], off[1]) <= 0.5 + ODOMETRY_DRIFT * driven_m
+    return bool(near and abs(off[2]) <= np.radians(20.0) + ODOMETRY_DRIFT * driven_m)
+
+
+def _stretches(views: Views, lost: NDArray[np.bool_]) -> Iterator[NDArray[np.int64]]:
+    """Runs of lost views that are long enough to be sought anew."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], lost, [False]]).astype(np.int8)))
+    for begin, end in edges.reshape(-1, 2):
+        way_m = views.driven_m[end - 1] - views.driven_m[begin]
+        took_s = (views.time_ns[end - 1] - views.time_ns[begin]) * 1e-9
+        if way_m >= LOST_M or took_s >= LOST_S:
+            yield np.arange(begin, end)
+
+
+def _search_places(views: Views, stretch: NDArray[np.int64]) -> list[int]:
+    """Views of a stretch, some metres apart, from which to seek the pose; the first among them."""
+    driven_m = views.driven_m[stretch]
+    way_m = driven_m[-1] - driven_m[0]
+    count = int(np.clip(np.ceil(way_m / SEARCH_EVERY_M), 1, MOST_SEARCHES))
+    at = driven_m[0] + way_m * np.arange(count) / count
+    return np.unique(stretch[np.searchsorted(driven_m, at)]).tolist()
