@@ -40,11 +40,16 @@ class AudioScan:
         :math:`\theta_n`, counter-clockwise in the array's frame, in [0, 2 pi) [rad].
     power : ndarray, shape (N,)
         :math:`J_n`, mean square of the beamformer output over the band [linear].
+    sharp : ndarray of float32, shape (N,), or None
+        The same with the sound whitened and high frequencies favoured: 1 for a plane wave alone,
+        1 over the number of microphones for noise that they do not share [-]. Its peaks lie nearer
+        to the true bearings; how loud they are it does not tell.
     """
 
     time_ns: int
     bearing_rad: FloatArray
     power: FloatArray
+    sharp: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         if self.power.shape != self.bearing_rad.shape:

@@ -19,10 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soundmap.config import ScanConfig
-from soundmap.geometry import FloatArray
 from soundmap.losses import LossLedger
 from soundmap.scan.cross_spectra import BaselineSpectra
-from soundmap.scan.response import steered_response_power
+from soundmap.scan.response import steered_response_power, whitened_spectra
 from soundmap.scan.spectrum import Framing, band_bins, hann_power
 from soundmap.scan.steering import SteeringTable, steering_table
 from soundmap.sensors import AudioBlock, MicArray
@@ -42,6 +41,7 @@ def audio_scans(
     *,
     losses: LossLedger | None = None,
     threads: int = 1,
+    sharp: bool = False,
 ) -> Iterator[AudioScan]:
     r"""Audio scans :math:`\{\theta_n(k), J_n(k)\}` of a stream of audio, in batches of about 3 s.
 
@@ -64,6 +64,8 @@ def audio_scans(
     threads : int, optional
         That many threads compute while the next blocks are read; with 1 the caller's own does. The
         scans are the same, bit for bit.
+    sharp : bool, optional
+        Whether to steer the whitened sound, too: `AudioScan.sharp`.
 
     Yields
     ------
@@ -88,7 +90,7 @@ def audio_scans(
             if stream is None or scanner is None or not stream.is_continued_by(block):
                 yield from _scans(workers, stream, scanner, losses, last=True)
                 if scanner is None or not scanner.suits(block):
-                    scanner = _Scanner.of(array, config, block.rate_hz, block.full_scale)
+                    scanner = _Scanner.of(array, config, block, sharp=sharp)
                 stream = _Stream(block.rate_hz, block.full_scale, scanner.framing)
             stream.append(block)
             del block  # a long one need not outlive its scans while the next is being read
@@ -177,10 +179,12 @@ class _Scanner:
     framing: Framing
     table: SteeringTable
     microphones: int
+    sharp: bool
     _own: local
 
     @classmethod
-    def of(cls, array: MicArray, config: ScanConfig, rate_hz: float, full_scale: float) -> _Scanner:
+    def of(cls, array: MicArray, config: ScanConfig, block: AudioBlock, *, sharp: bool) -> _Scanner:
+        rate_hz, full_scale = block.rate_hz, block.full_scale
         framing = Framing.from_times(
             rate_hz, window_s=config.window_s, hop_s=config.hop_s, frames=config.frames
         )
@@ -194,7 +198,7 @@ class _Scanner:
             speed_of_sound_m_s=config.speed_of_sound_m_s,
         )
         square = _square_of_unit(array, full_scale)
-        return cls(rate_hz, full_scale, square, framing, table, array.microphones, local())
+        return cls(rate_hz, full_scale, square, framing, table, array.microphones, sharp, local())
 
     def suits(self, block: AudioBlock) -> bool:
         """Whether the block's samples are of that rate and full scale."""
@@ -210,27 +214,42 @@ class _Scanner:
 
         The powers of a scan are not finite if any of its samples is not.
         """
-        power = self.power(samples, len(time_ns))
+        spectra, finite = self._spectra(samples, len(time_ns))
+        with np.errstate(invalid="ignore", over="ignore"):
+            raw = self._steered(spectra, finite)
+            norm = self.framing.frames * hann_power(self.framing.window) * self.microphones**2
+            power = raw.astype(np.float64) * (self.square_of_unit / norm)
+            sharp = None
+            if self.sharp:
+                white = self._steered(whitened_spectra(spectra, self.table), finite)
+                sharp = white / np.float32(self.microphones)
         return [
-            AudioScan(time, self.table.bearing_rad, scan)
-            for time, scan in zip(time_ns, power, strict=True)
+            AudioScan(time, self.table.bearing_rad, power[i], None if sharp is None else sharp[i])
+            for i, time in enumerate(time_ns)
         ]
 
-    def power(self, samples: NDArray[Any], scans: int) -> FloatArray:
-        """:math:`J_n` of consecutive scans, shape (scans, N) [square of the array's unit]."""
+    def _steered(
+        self, spectra: NDArray[np.float32], finite: NDArray[np.bool_]
+    ) -> NDArray[np.float32]:
+        """Power on every bearing of the scans of a batch, shape (scans, N)."""
+        power = steered_response_power(spectra, self.table)[: len(finite), 0]
+        power[~finite] = np.nan
+        return power
+
+    def _spectra(
+        self, samples: NDArray[Any], scans: int
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Cross-spectra of a whole batch, of which so many scans are filled and maybe finite."""
         if not hasattr(self._own, "spectra"):  # each thread has memory of its own
             self._own.spectra = BaselineSpectra(self.microphones, self.framing, self.table)
         spectra = np.zeros((self.batch, *self.table.spectra_shape), dtype=np.float32)
-        finite = np.zeros(self.batch, dtype=bool)
+        finite = np.zeros(scans, dtype=bool)
         with np.errstate(invalid="ignore", over="ignore"):
             for i in range(scans):
                 start = i * self.framing.advance
                 excerpt = samples[start : start + self.framing.span]
                 finite[i] = self._own.spectra.add(excerpt, spectra[i])
-            raw = steered_response_power(spectra, self.table)[:scans, 0].astype(np.float64)
-            raw[~finite[:scans]] = np.nan
-            norm = self.framing.frames * hann_power(self.framing.window) * self.microphones**2
-            return raw * (self.square_of_unit / norm)
+        return spectra, finite
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from soundmap.geometry import FloatArray
 from soundmap.scan.spectrum import Framing, band_bins, hann_power
-from soundmap.scan.steering import SteeringTable, steering_vectors
+from soundmap.scan.steering import LANES, SteeringTable, steering_vectors
+
+SILENT = 1e-4
+"""A bin with less than this share of the mean power of a scan's bins is not made any louder."""
 
 
 def steered_response_power(
@@ -55,6 +58,33 @@ def steered_response_power(
     power = np.concatenate([even + odd, even - odd], axis=2) if table.halved else even + odd
     # Where the array hears nothing, rounding may leave a little less than nothing.
     return np.maximum(power, np.float32(0.0))
+
+
+def whitened_spectra(spectra: NDArray[np.float32], table: SteeringTable) -> NDArray[np.float32]:
+    r"""Cross-spectra in which each bin is as loud as its frequency squared, whatever it was.
+
+    How sharply a bin tells the bearing of a wave grows with its frequency, and how far reflections
+    pull it off falls. Sounds that fade toward high frequencies, or hum in a few bins, hide that;
+    with
+
+    .. math:: R'_f = \frac{w_f f^2}{\mathrm{tr} R_f} R_f
+
+    normalised over the bins, a plane wave alone gives :math:`Q` where the beam looks along it and
+    noise that no two microphones share gives 1 on every bearing.
+
+    Parameters
+    ----------
+    spectra : ndarray of float32, shape (S, 2, M, B, LANES)
+        As `steered_response_power` takes them.
+    table : SteeringTable
+    """
+    frequency = table.block_bin[:, None] + np.arange(LANES)
+    share = table.cosine[0, :, 0] * frequency**2
+    own = spectra[:, 0, :, 0]
+    least = SILENT * own.mean(axis=(1, 2), keepdims=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        weight = np.where(own > 0.0, frequency**2 / np.maximum(own, least), 0.0)
+    return (spectra * (weight / share.sum())[:, None, :, None]).astype(np.float32)
 
 
 def steered_response_power_direct(

@@ -165,6 +165,43 @@ def test_the_fast_form_agrees_with_the_direct_sum(rate_hz, config):
         assert np.abs(scan.power - direct).max() < 2e-5 * direct.max()
 
 
+def sharp_scans(samples, positions):
+    return list(audio_scans(blocks_of(samples, RATE), mic_array(positions), PAPER, sharp=True))
+
+
+@pytest.mark.parametrize("slope_db_per_octave", [-12.0, 0.0, 12.0])
+def test_the_sharp_scan_of_a_wave_is_the_same_whatever_its_spectrum(slope_db_per_octave):
+    rng = np.random.default_rng(11)
+    positions = circle(16)
+    wave = noise(rng, RATE, round(0.46 * RATE), 1.0, 200.0, 20000.0)
+    frequency = np.fft.rfftfreq(len(wave), 1.0 / RATE)
+    colour = np.maximum(frequency / 1000.0, 0.1) ** (slope_db_per_octave / 6.02)
+    coloured = np.fft.irfft(np.fft.rfft(wave) * colour, len(wave))
+    for scan in sharp_scans(heard(coloured, 2.1, positions, RATE), positions):
+        at = np.argmax(scan.sharp)
+        assert scan.bearing_rad[at] == pytest.approx(2.1, abs=np.radians(1.6))
+        assert scan.sharp[at] == pytest.approx(1.0, abs=0.02)
+        # the lobe is that of equal bins weighted by frequency squared: -3 dB within 6 degrees
+        assert scan.sharp[(at + 2) % 120] < 0.5
+
+
+def test_the_sharp_scan_of_noise_that_no_two_microphones_share_is_one_over_their_number():
+    rng = np.random.default_rng(12)
+    scans = sharp_scans(rng.standard_normal((round(2.0 * RATE), 8)), circle(8))
+    assert np.mean([scan.sharp for scan in scans]) == pytest.approx(1.0 / 8.0, rel=0.01)
+
+
+def test_the_sharp_scan_of_silence_is_nought_and_none_is_made_unasked():
+    assert all(not scan.sharp.any() for scan in sharp_scans(np.zeros((9600, 4)), circle(4)))
+    assert scans_of(np.zeros((9600, 4)), circle(4))[0].sharp is None
+
+
+def test_the_sharp_scan_changes_nothing_about_the_power():
+    samples = np.random.default_rng(13).standard_normal((round(1.0 * RATE), 6))
+    plain, sharp = scans_of(samples, circle(6)), sharp_scans(samples, circle(6))
+    assert all(np.array_equal(a.power, b.power) for a, b in zip(plain, sharp, strict=True))
+
+
 def test_turning_the_array_turns_the_scan():
     rng = np.random.default_rng(7)
     positions = scattered(6, rng)
