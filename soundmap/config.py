@@ -165,6 +165,10 @@ class LocalizeConfig(Table):
     """... and at least this share of rays ends where the map says."""
 
 
+SUB_BAND_SHARES = (0.0, 0.2, 0.4, 0.7, 1.0)
+"""Edges of the sub-bands as shares of the band."""
+
+
 class ScanConfig(Table):
     """Audio scanning, Sect. 2.3."""
 
@@ -190,6 +194,16 @@ class ScanConfig(Table):
         if not self.hop_s <= self.window_s:
             raise ValueError("hop_s must not exceed window_s, or sound falls between windows")
         return self
+
+    @property
+    def sub_band_hz(self) -> tuple[float, ...]:
+        """Edges of the parts of the band whose power is told apart, the band's own included [Hz].
+
+        Beams narrow as the frequency rises: each part has beams of about one width.
+        """
+        return tuple(
+            self.low_hz + share * (self.high_hz - self.low_hz) for share in SUB_BAND_SHARES
+        )
 
 
 class FuseConfig(Table):

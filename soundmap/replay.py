@@ -10,6 +10,7 @@ from time import perf_counter
 from typing import Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from soundmap.config import Config, DetectConfig, DiffConfig, ScanConfig
 from soundmap.detect.difference import changed_places, power_ratio
@@ -94,7 +95,7 @@ def process(
         )
     with clock.stage("detect"):
         power_map = accumulator.power_map()
-        kept = keeper.audio_scans(reference, array.mount)
+        kept = keeper.audio_scans(reference, array.mount, config.scan.sub_band_hz)
         if config.detect.method == "sparse":
             around = np.array(around_m)
             sources = fitted_sources(
@@ -207,7 +208,8 @@ class _Keeper:
 
     def __init__(self) -> None:
         self._time_ns: list[int] = []
-        self._power: list[np.ndarray[tuple[int], np.dtype[np.float32]]] = []
+        self._power: list[NDArray[np.float32]] = []
+        self._sub_bands: list[NDArray[np.float32]] = []
         self._bearing_rad = np.empty(0)
 
     def __len__(self) -> int:
@@ -218,11 +220,26 @@ class _Keeper:
             self._time_ns.append(scan.time_ns)
             self._power.append(scan.power.astype(np.float32))
             self._bearing_rad = scan.bearing_rad
+            if scan.sub_bands is not None:
+                self._sub_bands.append(scan.sub_bands.astype(np.float32, copy=False))
             yield scan
 
-    def audio_scans(self, reference: LevelReference, mount: Mount) -> AudioScans:
+    def audio_scans(
+        self, reference: LevelReference, mount: Mount, sub_band_hz: tuple[float, ...]
+    ) -> AudioScans:
         time_ns = np.array(self._time_ns, dtype=np.int64)
-        return AudioScans(time_ns, self._bearing_rad, np.array(self._power), reference, mount)
+        parts = {part.shape for part in self._sub_bands}
+        told = len(parts) == 1 and len(self._sub_bands) == len(time_ns)
+        told &= parts == {(len(sub_band_hz) - 1, len(self._bearing_rad))}
+        return AudioScans(
+            time_ns,
+            self._bearing_rad,
+            np.array(self._power),
+            reference,
+            mount,
+            np.array(self._sub_bands) if told else None,
+            sub_band_hz if told else (),
+        )
 
 
 class _Stopwatch:

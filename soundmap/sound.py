@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,12 +45,15 @@ class AudioScan:
         The same with the sound whitened and high frequencies favoured: 1 for a plane wave alone,
         1 over the number of microphones for noise that they do not share [-]. Its peaks lie nearer
         to the true bearings; how loud they are it does not tell.
+    sub_bands : ndarray, shape (B, N), or None
+        The same of each part of the band, which sum up to it; None if they are not told apart.
     """
 
     time_ns: int
     bearing_rad: FloatArray
     power: FloatArray
     sharp: NDArray[np.float32] | None = None
+    sub_bands: NDArray[np.floating[Any]] | None = None
 
     def __post_init__(self) -> None:
         if self.power.shape != self.bearing_rad.shape:
@@ -100,6 +104,10 @@ class AudioScans:
     reference : LevelReference
     mount : Mount or None
         Where the array sits on the robot, and its bearings with it; None if nobody knows.
+    sub_bands : ndarray of float32, shape (S, B, N), or None
+        Power of each part of the band [linear]; None if they were not told apart.
+    sub_band_hz : tuple of float
+        The B + 1 edges of those parts [Hz].
     """
 
     time_ns: NDArray[np.int64]
@@ -107,10 +115,16 @@ class AudioScans:
     power: NDArray[np.float32]
     reference: LevelReference
     mount: Mount | None = None
+    sub_bands: NDArray[np.float32] | None = None
+    sub_band_hz: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.power.shape != (len(self.time_ns), len(self.bearing_rad)):
+        scans, bearings = len(self.time_ns), len(self.bearing_rad)
+        if self.power.shape != (scans, bearings):
             raise ValueError("audio scans need one power a time and bearing")
+        parts = max(len(self.sub_band_hz) - 1, 0)
+        if self.sub_bands is not None and self.sub_bands.shape != (scans, parts, bearings):
+            raise ValueError("audio scans need one power a time, sub-band and bearing")
 
     def __len__(self) -> int:
         return len(self.time_ns)

@@ -169,11 +169,16 @@ def _audio_scan_arrays(scans: AudioScans) -> dict[str, ArrayLike]:
     if scans.mount is not None:
         mount["array_rotation"] = scans.mount.rotation
         mount["array_translation_m"] = scans.mount.translation_m
+    parts: dict[str, ArrayLike] = {}
+    if scans.sub_bands is not None:
+        parts["sub_band_power"] = scans.sub_bands
+        parts["sub_band_hz"] = scans.sub_band_hz
     return {
         "time_ns": scans.time_ns,
         "bearing_rad": scans.bearing_rad,
         "power": scans.power.astype(np.float32, copy=False),
         "reference": str(scans.reference),
+        **parts,
         **mount,
         "schema_version": SCHEMA_VERSION,
     }

@@ -222,7 +222,11 @@ def _audio_scans(stored: Stored) -> AudioScans:
         mount = Mount(stored["array_rotation"], stored["array_translation_m"])
     reference = LevelReference(str(stored["reference"]))
     time_ns, bearing = stored["time_ns"], stored["bearing_rad"]
-    return AudioScans(time_ns, bearing, stored["power"], reference, mount)
+    parts, edges = None, tuple[float, ...]()
+    if "sub_band_power" in stored:
+        parts = stored["sub_band_power"]
+        edges = tuple(float(edge) for edge in stored["sub_band_hz"])
+    return AudioScans(time_ns, bearing, stored["power"], reference, mount, parts, edges)
 
 
 def _trajectory(stored: Stored) -> Trajectory:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soundmap.config import ScanConfig
+from soundmap.geometry import FloatArray
 from soundmap.losses import LossLedger
 from soundmap.scan.cross_spectra import BaselineSpectra
 from soundmap.scan.response import steered_response_power, whitened_spectra
@@ -169,6 +170,13 @@ def _square_of_unit(array: MicArray, full_scale: float) -> float:
     return full_scale**-2
 
 
+def _splits(frequency_hz: FloatArray, edges_hz: tuple[float, ...]) -> list[int]:
+    """Index of the first bin of each sub-band but the lowest; none if one would have no bin."""
+    splits = np.searchsorted(frequency_hz, edges_hz[1:-1], side="left")
+    every = np.concatenate([[0], splits, [len(frequency_hz)]])
+    return splits.tolist() if np.all(np.diff(every) > 0) else []
+
+
 @dataclass(frozen=True)
 class _Scanner:
     """What turning samples of one rate and full scale into power takes, worked out once."""
@@ -196,6 +204,7 @@ class _Scanner:
             frequency_hz=band.frequency_hz,
             weight=band.weight,
             speed_of_sound_m_s=config.speed_of_sound_m_s,
+            splits=_splits(band.frequency_hz, config.sub_band_hz),
         )
         square = _square_of_unit(array, full_scale)
         return cls(rate_hz, full_scale, square, framing, table, array.microphones, sharp, local())
@@ -224,15 +233,21 @@ class _Scanner:
                 white = self._steered(whitened_spectra(spectra, self.table), finite)
                 sharp = white / np.float32(self.microphones)
         return [
-            AudioScan(time, self.table.bearing_rad, power[i], None if sharp is None else sharp[i])
+            AudioScan(
+                time,
+                self.table.bearing_rad,
+                power[i].sum(axis=0),
+                None if sharp is None else sharp[i].sum(axis=0),
+                power[i].astype(np.float32),
+            )
             for i, time in enumerate(time_ns)
         ]
 
     def _steered(
         self, spectra: NDArray[np.float32], finite: NDArray[np.bool_]
     ) -> NDArray[np.float32]:
-        """Power on every bearing of the scans of a batch, shape (scans, N)."""
-        power = steered_response_power(spectra, self.table)[: len(finite), 0]
+        """Power of each sub-band on every bearing of the scans of a batch, (scans, B, N)."""
+        power = steered_response_power(spectra, self.table)[: len(finite)]
         power[~finite] = np.nan
         return power
 

@@ -457,3 +457,12 @@ def test_a_talker_recorded_with_a_real_array_is_found_within_one_degree():
         scans = scans_of(samples, positions, float(rate_hz), full_scale=32768.0)
         mean = AudioScan(0, scans[0].bearing_rad, mean_power(scans))
         assert np.degrees(angle_between(mean.peaks()[0][0], np.pi)) < 1.0, file
+
+
+def test_the_sub_bands_add_up_to_the_band_and_tell_its_parts_apart():
+    time_s = np.arange(round(0.3 * RATE)) / RATE
+    tone = np.sin(2.0 * np.pi * 5500.0 * time_s)[:, None] * np.ones(16)
+    scan = scans_of(tone.astype(np.float32), circle(16, 0.155))[0]
+    np.testing.assert_allclose(scan.sub_bands.sum(axis=0), scan.power, rtol=1e-5)
+    assert scan.sub_bands.max(axis=1).argmax() == 3
+    assert scan.sub_bands[:3].max() < 1e-4 * scan.sub_bands[3].max()
