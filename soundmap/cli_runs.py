@@ -42,14 +42,15 @@ def diff(
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Show what is louder in one run than in another.
+    """Show what is louder or quieter in one run than in another.
 
-    Writes a folder with the difference of the two power maps in dB and its local maxima.
+    Writes a folder with the difference of the two power maps in dB, what became of each source,
+    and how sure that is.
     """
+    from soundmap.comparison import compared
     from soundmap.outputs.new_folder import folder_for_difference, new_folder
     from soundmap.outputs.run_folder import write_diff
     from soundmap.outputs.summary import diff_view
-    from soundmap.replay import compared
 
     settings = resolved_config(config)
     folder = out if out is not None else folder_for_difference(run, background)
@@ -66,6 +67,7 @@ def diff(
             background=background,
             config=settings.diff,
             timings_s=timings_s,
+            notes=comparison.notes,
             figures=figures,
         )
     if not quiet or as_json:

@@ -244,10 +244,15 @@ class DetectConfig(Table):
 
 
 class DiffConfig(Table):
-    """Difference of two power maps, Sects. 4 and 5."""
+    """Difference of two runs: of their power maps, Sects. 4 and 5, and of their sources."""
 
     min_ratio_db: float = 3.0
-    """A change is reported when a local maximum of the difference exceeds this [dB]."""
+    """A local maximum of the difference of the maps is reported above this [dB]."""
+    min_change_db: NotNegative = 1.5
+    """A source has changed when its level differs for sure by more than this [dB]: what directivity
+    may do to an unchanged one between one way past it and another."""
+    false_alarm_rate: Annotated[float, Field(gt=0, lt=1)] = 0.01
+    """Share of pairs of unchanged runs in which any source may be said to have changed."""
 
 
 class Config(Table):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 from typing import Protocol, TypeVar
@@ -12,11 +11,10 @@ from typing import Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from soundmap.config import Config, DetectConfig, DiffConfig, ScanConfig
-from soundmap.detect.difference import changed_places, power_ratio
+from soundmap.config import Config, ScanConfig
 from soundmap.detect.fitted_sources import fitted_sources
 from soundmap.detect.source_list import detect_sources
-from soundmap.errors import ConfigError, NothingUsableError, OutputError
+from soundmap.errors import ConfigError, NothingUsableError
 from soundmap.fuse.accumulate import PowerAccumulator
 from soundmap.fuse.power_map import fused_scans, level_reference, power_map_frame
 from soundmap.geometry import Mount, Trajectory
@@ -26,11 +24,10 @@ from soundmap.logs.robot_log import RobotLog, open_log
 from soundmap.map_file import read_map
 from soundmap.mapping.geometric_map import build_map
 from soundmap.outputs.progress import Progress, Stage
-from soundmap.outputs.stored_run import read_power_map
 from soundmap.run import Run
 from soundmap.scan.audio_scan import audio_scans
 from soundmap.scan.spectrum import band_bins
-from soundmap.sound import AudioScan, AudioScans, LevelReference, PowerRatio
+from soundmap.sound import AudioScan, AudioScans, LevelReference
 
 
 def process(
@@ -117,59 +114,6 @@ def process(
         timings_s=clock.timings_s,
         duration_s=duration_s,
     )
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """The results of ``soundmap diff``.
-
-    Attributes
-    ----------
-    ratio : PowerRatio
-    room : OccupancyGrid
-        The geometric map of the run.
-    run, background : Path
-        The two run folders.
-    """
-
-    ratio: PowerRatio
-    room: OccupancyGrid
-    run: Path
-    background: Path
-
-
-def compared(run: Path, background: Path, diff: DiffConfig, detect: DetectConfig) -> Comparison:
-    """Difference in dB of the power maps of two run folders, Sect. 4.
-
-    Raises
-    ------
-    SoundmapError
-        One of them is no run folder, or the two cannot be compared.
-    """
-    loud, loud_share = read_power_map(run)
-    quiet, quiet_share = read_power_map(background)
-    if loud.reference != quiet.reference:
-        raise OutputError(
-            f"{run} is in {loud.reference}, {background} in {quiet.reference}: process both with "
-            "the same pascal_per_count."
-        )
-    if not quiet.visits.any():
-        raise OutputError(f"{background}: the power map holds no measurement to compare with.")
-    ratio_db, measured = power_ratio(
-        loud.power(min_visit_share=loud_share),
-        loud.frame,
-        quiet.power(min_visit_share=quiet_share),
-        quiet.frame,
-    )
-    ratio = changed_places(
-        ratio_db,
-        loud.visits,
-        measured,
-        loud.frame,
-        separation_m=detect.separation_m,
-        min_ratio_db=diff.min_ratio_db,
-    )
-    return Comparison(ratio, read_map(run / "map.yaml"), run, background)
 
 
 def _placed(

@@ -143,16 +143,21 @@ class PowerMap:
     visits : ndarray of int64, shape (H, W)
         :math:`K_{ij}`.
     reference : LevelReference
+    square_sum : ndarray, shape (H, W), or None
+        Sum of the squares of the shares, which tells how they scatter; None if unknown.
     """
 
     frame: GridFrame
     power_sum: FloatArray
     visits: NDArray[np.int64]
     reference: LevelReference
+    square_sum: FloatArray | None = None
 
     def __post_init__(self) -> None:
         if self.power_sum.shape != self.frame.shape or self.visits.shape != self.frame.shape:
             raise ValueError("a power map needs one sum and one count a cell")
+        if self.square_sum is not None and self.square_sum.shape != self.frame.shape:
+            raise ValueError("a power map needs one sum of squares a cell")
 
     def power(self, *, min_visit_share: float = 0.0) -> FloatArray:
         """:math:`P_{ij}`, shape (H, W) [linear]; NaN where not measured or visited too rarely.
@@ -164,6 +169,18 @@ class PowerMap:
         seen &= self.visits > 0
         with np.errstate(invalid="ignore"):
             return np.where(seen, self.power_sum / np.maximum(self.visits, 1), np.nan)
+
+    def spread(self) -> FloatArray:
+        """Standard deviation of the shares that each cell received, shape (H, W) [linear].
+
+        NaN where fewer than two visits, or nothing, tells of it.
+        """
+        if self.square_sum is None:
+            return np.full(self.frame.shape, np.nan)
+        many = np.maximum(self.visits, 2)
+        excess = self.square_sum - self.power_sum**2 / many
+        variance = np.maximum(excess, 0.0) / (many - 1)
+        return np.where(self.visits > 1, np.sqrt(variance), np.nan)
 
 
 @dataclass(frozen=True)
@@ -256,48 +273,3 @@ class SourceList:
 
     def __len__(self) -> int:
         return len(self.sources)
-
-
-@dataclass(frozen=True)
-class Change:
-    """A place that is louder in one run than in another.
-
-    Attributes
-    ----------
-    x_m, y_m : float
-        Position in the map frame [m].
-    ratio_db : float
-        Power of the run over that of the background [dB].
-    visits : int
-        Visits of the cell in the run.
-    """
-
-    x_m: float
-    y_m: float
-    ratio_db: float
-    visits: int
-
-
-@dataclass(frozen=True)
-class PowerRatio:
-    """Difference of two power maps in dB, Sect. 4 and Fig. 7.
-
-    Attributes
-    ----------
-    frame : GridFrame
-        That of the run.
-    ratio_db : ndarray, shape (H, W)
-        Power of the run over that of the background [dB]; NaN where the run did not measure.
-    visits : ndarray of int64, shape (H, W)
-        Visits in the run.
-    background_measured : ndarray of bool, shape (H, W)
-        Where the background has a measurement of its own; elsewhere its median stands in.
-    changes : tuple of Change
-        Local maxima, greatest ratio first.
-    """
-
-    frame: GridFrame
-    ratio_db: FloatArray
-    visits: NDArray[np.int64]
-    background_measured: NDArray[np.bool_]
-    changes: tuple[Change, ...]

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from soundmap.change import Change, ChangeKind, PowerRatio
 from soundmap.config import Config
 from soundmap.geometry import Trajectory
 from soundmap.grid import GridFrame, OccupancyGrid
@@ -12,11 +13,11 @@ from soundmap.losses import Loss
 from soundmap.run import Run
 from soundmap.sound import (
     AudioScans,
-    Change,
     LevelReference,
     PowerMap,
-    PowerRatio,
+    Reflection,
     Source,
+    SourceFit,
     SourceList,
 )
 
@@ -94,6 +95,18 @@ def made_run(log: Path = Path("logs/run1.mcap"), *, config: Config | None = None
     )
 
 
+def fitted_run(log: Path = Path("logs/run1.mcap")) -> Run:
+    """A run whose sources come from a fit: one is sure, the other is not; with mirror images."""
+    run = made_run(log)
+    sure, doubtful = run.sources.sources
+    near = SourceFit(sure.power, np.diag([0.02**2, 0.02**2]), 1e-12, 2.0, ())
+    flags = ("not_seen_by_laser", "unsteady")
+    far = SourceFit(doubtful.power, np.diag([0.12**2, 0.05**2]), 0.004, 0.5, flags)
+    images = (Reflection(3.1, -0.4, 1e-8, 0), Reflection(9.0, 9.0, 5e-9, None))
+    sources = (replace(sure, fit=near), replace(doubtful, fit=far))
+    return replace(run, sources=SourceList(sources, FULL_SCALE, images))
+
+
 def unlucky_run(log: Path = Path("logs/run1.mcap")) -> Run:
     """A run that heard nothing: no audio scans, no cells, no sources, no losses."""
     run = made_run(log)
@@ -115,12 +128,18 @@ def unlucky_run(log: Path = Path("logs/run1.mcap")) -> Run:
 
 
 def made_ratio() -> PowerRatio:
-    """A difference of two maps, in part without a background, with two changes."""
+    """A difference of two maps, in part without a background, with changes of three kinds."""
     room = walled_room()
     run = heard_map(room.frame, [(3.1, 0.25, 4e-7), (5.75, 3.4, 1e-7)])
     background = heard_map(room.frame, [(1.0, 3.0, 2e-7)], seed=6)
     power, floor = run.power(), background.power()
     measured = np.isfinite(floor)
     ratio_db = 10 * np.log10(power / np.where(measured, floor, np.nanmedian(floor)))
-    changes = (Change(3.125, 0.275, 26.0204, 22), Change(5.725, 3.375, 19.9, 17))
+    appeared, louder, gone = ChangeKind.APPEARED, ChangeKind.LOUDER, ChangeKind.GONE
+    changes = (
+        Change(3.125, 0.275, 26.0204, 22, appeared, None, 1e-9, 0, None),
+        Change(5.725, 3.375, 19.9, 17, louder, 0.4, 0.002, 1, 0),
+        Change(1.0, 3.0, -14.0, 2, gone, None, 0.001, None, 1),
+        Change(3.0, 4.2, 0.7, 9, ChangeKind.UNCHANGED, 0.5, 0.8, 2, 2),
+    )
     return PowerRatio(room.frame, ratio_db, run.visits, measured, changes)

@@ -7,7 +7,9 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "soundmap"
 STAGES = {"logs", "mapping", "localize", "scan", "fuse", "detect"}
-COMPOSERS = {"replay", "map_log", "retelling", "cli", "cli_map", "cli_runs", "terminal"}
+COMPOSERS = {
+    "replay", "map_log", "retelling", "comparison", "cli", "cli_map", "cli_runs", "terminal",
+}  # fmt: skip
 SLOW = {"numba", "scipy", "matplotlib", "rerun", "google"}
 
 

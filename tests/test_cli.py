@@ -14,6 +14,7 @@ import pytest
 from handmade import made_ratio, made_run, walled_room
 from typer.testing import CliRunner
 
+import soundmap.comparison
 import soundmap.logs.summary
 import soundmap.outputs.pictures
 import soundmap.outputs.viewer
@@ -254,9 +255,10 @@ def two_runs(monkeypatch, tmp_path, _no_pictures) -> Path:
         write_run(made_run(Path(f"{name}.mcap")), tmp_path / name)
 
     def compared(run, background, diff, detect):
-        return soundmap.replay.Comparison(made_ratio(), walled_room(), run, background)
+        ratio, room = made_ratio(), walled_room()
+        return soundmap.comparison.Comparison(ratio, room, run, background, notes=())
 
-    monkeypatch.setattr(soundmap.replay, "compared", compared)
+    monkeypatch.setattr(soundmap.comparison, "compared", compared)
     return tmp_path
 
 

@@ -54,6 +54,7 @@ class PowerAccumulator:
     def __init__(self, frame: GridFrame, reference: LevelReference) -> None:
         self._frame, self._reference = frame, reference
         self._power_sum = np.zeros(frame.shape)
+        self._square_sum = np.zeros(frame.shape)
         self._visits = np.zeros(frame.shape, dtype=np.int64)
 
     def add(self, point_m: ArrayLike, power: float, *, size_m: float) -> bool:
@@ -86,12 +87,19 @@ class PowerAccumulator:
         share = power / len(cells)
         row, column = cells[self._frame.contains(cells)].T
         self._power_sum[row, column] += share
+        self._square_sum[row, column] += share**2
         self._visits[row, column] += 1
         return True
 
     def power_map(self) -> PowerMap:
         """The power map so far, as a copy that does not grow."""
-        return PowerMap(self._frame, self._power_sum.copy(), self._visits.copy(), self._reference)
+        return PowerMap(
+            self._frame,
+            self._power_sum.copy(),
+            self._visits.copy(),
+            self._reference,
+            self._square_sum.copy(),
+        )
 
 
 def strongest_candidate(emitted: FloatArray) -> int | None:

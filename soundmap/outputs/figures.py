@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,36 +9,47 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
+from soundmap.change import ChangeKind, PowerRatio
 from soundmap.geometry import FloatArray, Trajectory
 from soundmap.grid import GridFrame, OccupancyGrid
-from soundmap.outputs.floor import FloorPlan, area_of_interest
+from soundmap.outputs.floor import DOUBTFUL, FOUND, FloorPlan, Mark, Places, area_of_interest
 from soundmap.run import Run
-from soundmap.sound import PowerRatio, decibels
+from soundmap.sound import SourceList, decibels
 
 # Okabe and Ito's colours, told apart with any kind of colour vision.
 BLUE, VERMILION, GREEN = "#0072B2", "#D55E00", "#009E73"
 SHOWN_RANGE_DB = 30.0
 LEAST_RATIO_DB, GREATEST_RATIO_DB = 3.0, 20.0
+SURE, PALE = 0.01, 0.3
+"""A cell whose difference is less probable than this by chance has its full colour; others have
+this opacity."""
 ARROWS = 10
-
-Places = Sequence[tuple[float, float]]
+CHANGED = {
+    ChangeKind.APPEARED: Mark("appeared", marker="P", size=12.0),
+    ChangeKind.LOUDER: Mark("louder", marker="^", size=12.0),
+    ChangeKind.QUIETER: Mark("quieter", marker="v", size=12.0),
+    ChangeKind.GONE: Mark("gone", marker="X", size=12.0),
+    ChangeKind.UNCHANGED: Mark("unchanged", colour="0.35", size=10.0),
+    ChangeKind.UNTOLD: Mark("cannot be told", marker="s", colour="0.35", size=9.0),
+}
 
 
 def trajectory_figure(run: Run) -> Figure:
     """Fig. 2: geometric map, way of the robot, sources."""
-    places = [(source.x_m, source.y_m) for source in run.sources]
     title = f"{run.log.stem}: geometric map and trajectory"
-    return map_figure(run.room, run.trajectory, title, places=places)
+    return map_figure(run.room, run.trajectory, title, sources=run.sources)
 
 
 def map_figure(
-    room: OccupancyGrid, trajectory: Trajectory, title: str, *, places: Places = ()
+    room: OccupancyGrid, trajectory: Trajectory, title: str, *, sources: SourceList | None = None
 ) -> Figure:
-    """Fig. 2: geometric map and way of the robot, with places if there are any."""
+    """Fig. 2: geometric map and way of the robot, with sources if there are any."""
+    places = [(source.x_m, source.y_m) for source in sources or ()]
     area = area_of_interest([trajectory.pose[:, :2], _points(places)], room)
     plan = FloorPlan(area, room, title)
     _draw_trajectory(plan.axes, trajectory)
-    plan.draw_places(places)
+    if sources is not None:
+        _draw_sources(plan, sources)
     return plan.finished()
 
 
@@ -76,24 +86,30 @@ def power_map_figure(run: Run, *, truth: Places = ()) -> Figure:
         plan.add_colour_bar(image, label, "min" if np.any(level < low) else "neither")
     plan.draw_wall_outlines()
     plan.axes.plot(*run.trajectory.pose[:, :2].T, color="0.45", linewidth=0.8, label="trajectory")
-    plan.draw_places(places)
+    _draw_sources(plan, run.sources)
     plan.draw_truth(truth)
     return plan.finished()
 
 
 def power_ratio_figure(ratio: PowerRatio, *, room: OccupancyGrid | None, title: str) -> Figure:
-    """Fig. 7: difference of two power maps in dB; red is louder than the background."""
+    """Fig. 7: difference of two power maps in dB; red is louder than the background.
+
+    Cells whose difference chance would often show are pale.
+    """
     level = ratio.ratio_db
     places = [(change.x_m, change.y_m) for change in ratio.changes]
     area = area_of_interest([_measured_points(level, ratio.frame), _points(places)], room)
     plan = FloorPlan(area, room, f"{title}: difference of power maps", dimmed=True)
-    finite = np.abs(level[np.isfinite(level)])
+    ratios = np.array([change.ratio_db for change in ratio.changes])
+    shown = np.abs(np.concatenate([level.ravel(), ratios]))
+    finite = shown[np.isfinite(shown)]
     reach = float(np.clip(finite.max(initial=0.0), LEAST_RATIO_DB, GREATEST_RATIO_DB))
     part, extent = plan.blocks(level, ratio.frame, _farthest_from_zero)
     image = plan.axes.imshow(
         np.clip(part.astype(np.float64), -reach, reach),
         origin="lower",
         extent=extent,
+        alpha=_opacity(plan, ratio),
         cmap="RdBu_r",
         vmin=-reach,
         vmax=reach,
@@ -102,7 +118,8 @@ def power_ratio_figure(ratio: PowerRatio, *, room: OccupancyGrid | None, title: 
     if np.isnan(level).all():
         say_nothing_measured(plan.axes)
     else:
-        plan.add_colour_bar(image, "louder than the background by [dB]", _open_ends(level, reach))
+        every = np.concatenate([level.ravel(), ratios])
+        plan.add_colour_bar(image, "louder than the background by [dB]", _open_ends(every, reach))
     without = np.argwhere(np.isfinite(level) & ~ratio.background_measured)
     if len(without):
         plan.axes.plot(
@@ -114,8 +131,31 @@ def power_ratio_figure(ratio: PowerRatio, *, room: OccupancyGrid | None, title: 
             label="against the background's median",
         )
     plan.draw_wall_outlines()
-    plan.draw_places(places)
+    plan.draw_places(
+        places, [CHANGED[change.kind] for change in ratio.changes], list(image.to_rgba(ratios))
+    )
     return plan.finished()
+
+
+def _draw_sources(plan: FloorPlan, sources: SourceList) -> None:
+    """Sources with what is known of their places, and mirror images."""
+    places = [(source.x_m, source.y_m) for source in sources]
+    fitted = [source for source in sources if source.fit is not None]
+    plan.draw_images([(image.x_m, image.y_m) for image in sources.reflections], places)
+    plan.draw_ellipses(
+        [(source.x_m, source.y_m) for source in fitted],
+        [source.fit.covariance_m2 for source in fitted if source.fit is not None],
+    )
+    doubtful = [source.fit is not None and bool(source.fit.flags) for source in sources]
+    plan.draw_places(places, [DOUBTFUL if doubt else FOUND for doubt in doubtful])
+
+
+def _opacity(plan: FloorPlan, ratio: PowerRatio) -> FloatArray | None:
+    """Of each square of a difference: full where it is significant; None if nobody knows."""
+    if ratio.chance is None:
+        return None
+    sure, _ = plan.blocks(ratio.chance < SURE, ratio.frame, np.max)
+    return np.where(sure, 1.0, PALE)
 
 
 def shown_range(level: FloatArray) -> tuple[float, float]:

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib import patheffects
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from soundmap.geometry import FloatArray
 from soundmap.grid import GridFrame, OccupancyGrid
 from soundmap.outputs.labels import label_offsets
+from soundmap.outputs.wording import ellipse_95
 
 WALL, UNKNOWN, OPEN = 0.25, 0.90, 1.0
 DIMMED_UNKNOWN, DIMMED_OPEN = 0.80, 0.90
@@ -37,7 +39,37 @@ BAR_LABEL_INCHES = 3.9
 LEGEND_ROW, LEGEND_ENTRY = 0.26, 1.35
 LEAST_WIDTH_INCHES = 5.0
 CIRCLE_POINTS = 15.0
-TRUTH = "#D55E00"
+
+Places = Sequence[tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class Mark:
+    """How a kind of place is marked.
+
+    Attributes
+    ----------
+    label : str
+        In the legend.
+    marker, colour : str
+        As matplotlib takes them.
+    size : float
+        [points]
+    suffix : str
+        Added to the names of such places.
+    """
+
+    label: str
+    marker: str = "o"
+    colour: str = "black"
+    size: float = CIRCLE_POINTS
+    suffix: str = ""
+
+
+FOUND = Mark("found here")
+DOUBTFUL = Mark("found here, with remarks", marker="s", size=13.0, suffix="*")
+IMAGE = Mark("mirror image", marker="D", colour="0.45", size=5.0)
+TRUTH = Mark("truth", marker="x", colour="#D55E00", size=9.0)
 
 
 @dataclass(frozen=True)
@@ -174,17 +206,32 @@ class FloorPlan:
         y = bottom + (np.arange(part.shape[0]) + 0.5) * (top - bottom) / part.shape[0]
         self.axes.contour(x, y, part.astype(np.float32), [0.5], colors=[str(WALL)], linewidths=0.7)
 
-    def draw_places(self, places_m: Sequence[tuple[float, float]]) -> None:
-        """Circles labelled S1, S2, ... in the order given; crowded ones go without a label."""
+    def draw_places(
+        self, places_m: Places, marks: Sequence[Mark], fills: Sequence[Any] | None = None
+    ) -> None:
+        """Markers named S1, S2, ... in the order given; crowded ones go without a name.
+
+        Parameters
+        ----------
+        places_m : sequence of tuple
+            x, y [m].
+        marks : sequence of Mark
+            How each is marked; those of one mark share an entry of the legend.
+        fills : sequence of colours, optional
+            What fills each marker; by default they are hollow.
+        """
         if not places_m:
             return
         points = (np.array(places_m) - [self.area.left, self.area.bottom]) * self.scale * 72.0
-        names = [f"S{number}" for number in range(1, len(places_m) + 1)]
+        names = [f"S{number}{mark.suffix}" for number, mark in enumerate(marks, start=1)]
         size = (self.area.width * self.scale * 72.0, self.area.height * self.scale * 72.0)
         offsets = label_offsets(points, names, size, marker=CIRCLE_POINTS)
-        some = any(offset is None for offset in offsets)
-        self._mark(places_m, "o", "black", "found here (some unlabelled)" if some else "")
-        for place, name, offset in zip(places_m, names, offsets, strict=True):
+        unnamed = " (some unnamed)" if any(offset is None for offset in offsets) else ""
+        for mark in dict.fromkeys(marks):
+            own = [index for index, its in enumerate(marks) if its == mark]
+            filled = "none" if fills is None else [fills[index] for index in own]
+            self._mark([places_m[index] for index in own], mark, unnamed, filled)
+        for place, name, mark, offset in zip(places_m, names, marks, offsets, strict=True):
             if offset is not None:
                 text = self.axes.annotate(
                     name,
@@ -194,15 +241,44 @@ class FloorPlan:
                     ha="center",
                     va="center",
                     weight="bold",
+                    color=mark.colour,
                     fontsize=9,
                     zorder=6,
                 )
                 text.set_path_effects(_halo())
 
-    def draw_truth(self, places_m: Sequence[tuple[float, float]]) -> None:
+    def draw_ellipses(self, places_m: Places, covariances_m2: Sequence[FloatArray]) -> None:
+        """Where the places lie with 95 %, if that is more than their markers cover."""
+        reach = 0.5 * CIRCLE_POINTS / 72.0 / self.scale
+        ellipses = map(ellipse_95, covariances_m2)
+        lines = [
+            np.array(place) + ellipse
+            for place, ellipse in zip(places_m, ellipses, strict=True)
+            if np.hypot(*ellipse.T).max() > reach
+        ]
+        if not lines:
+            return
+        self.axes.add_collection(
+            LineCollection(lines, colors="black", linewidths=0.9, label="95 %", zorder=4.5)
+        )
+
+    def draw_images(self, places_m: Places, sources_m: Places) -> None:
+        """Small marks at mirror images in the picture, but for those under a source's marker."""
+        area, reach = self.area, CIRCLE_POINTS / 72.0 / self.scale
+        inside = [
+            (x, y)
+            for x, y in places_m
+            if area.left <= x <= area.right
+            and area.bottom <= y <= area.top
+            and all(np.hypot(x - a, y - b) > reach for a, b in sources_m)
+        ]
+        if inside:
+            self._mark(inside, IMAGE)
+
+    def draw_truth(self, places_m: Places) -> None:
         """Crosses where the sources truly are."""
         if places_m:
-            self._mark(places_m, "x", TRUTH, "truth", size=9.0)
+            self._mark(places_m, TRUTH)
 
     def finished(self) -> Figure:
         """The figure with everything in its place."""
@@ -260,26 +336,18 @@ class FloorPlan:
         dots = frame.resolution_m * self.scale * DOTS_PER_INCH
         return max(1, int(np.ceil(LEAST_CELL_DOTS / dots - 1e-9)))
 
-    def _mark(
-        self,
-        places_m: Sequence[tuple[float, float]],
-        marker: str,
-        colour: str,
-        label: str,
-        size: float = CIRCLE_POINTS,
-    ) -> None:
+    def _mark(self, places_m: Places, mark: Mark, remark: str = "", fill: Any = "none") -> None:
         x, y = np.array(places_m).T
-        self.axes.plot(
+        self.axes.scatter(
             x,
             y,
-            linestyle="none",
-            marker=marker,
-            markersize=size,
-            markerfacecolor="none",
-            markeredgecolor=colour,
-            markeredgewidth=1.4,
+            s=mark.size**2,
+            marker=mark.marker,
+            facecolors=mark.colour if mark.marker == "x" else fill,
+            edgecolors=None if mark.marker == "x" else mark.colour,
+            linewidths=1.4,
             path_effects=_halo(),
-            label=label or "found here",
+            label=mark.label + remark,
             zorder=5,
         )
 

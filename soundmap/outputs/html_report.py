@@ -6,14 +6,22 @@ The page holds everything itself: pictures, style, no script. It needs no networ
 from __future__ import annotations
 
 import base64
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
 import tomli_w
 
-from soundmap.outputs.level_plot import level_plot
+from soundmap.outputs.html_findings import (
+    changes_table,
+    html_table,
+    reflections_table,
+    sources_table,
+)
+from soundmap.outputs.wording import NOTHING, number_text, printed_reference
 
+KINDS = ("appeared", "louder", "quieter", "gone", "unchanged", "untold")
 CAPTIONS = {
     "power_map": "Where it is loud: mean emitted power over the geometric map. Cells without "
     "colour were not measured, or too rarely to count; they need not be quiet.",
@@ -23,16 +31,6 @@ CAPTIONS = {
     "power_ratio": "What changed: red is louder than the background, blue is quieter, no colour "
     "was not measured.",
 }
-HEADINGS = {
-    "id": "Source",
-    "x_m": "x [m]",
-    "y_m": "y [m]",
-    "power_db": "Level [dB]",
-    "ratio_db": "Louder by [dB]",
-    "visits": "Visits",
-}
-NOTHING = "-"
-HIDDEN = {"power_reference"}
 STYLE = """
 :root { color-scheme: light; }
 * { box-sizing: border-box; }
@@ -85,9 +83,13 @@ def report_html(report: Mapping[str, Any], pictures: Mapping[str, bytes]) -> str
         f'<p class="lead">{escape(_lead(report, compares=compares))}</p>',
         _facts(_run_facts(report) if not compares else _diff_facts(report)),
         *(_figure(name, content) for name, content in list(pictures.items())[:1]),
-        _section("Places that are louder" if compares else "Sources", _sources(report)),
+        *(
+            [_section("What changed", changes_table(report))]
+            if compares
+            else [_section("Sources", sources_table(report)), *_mirror_images(report)]
+        ),
         *(_figure(name, content) for name, content in list(pictures.items())[1:]),
-        *([] if compares else [_section("What was lost", _losses(report["losses"]))]),
+        *_what_was_lost(report, compares=compares),
         _section("How it was made", _provenance(report)),
         _section("Configuration", _configuration(report["config"])),
     ]
@@ -107,14 +109,13 @@ def _page(title: str, body: str) -> str:
 
 
 def _lead(report: Mapping[str, Any], *, compares: bool) -> str:
+    if compares:
+        return _lead_of_changes(report["changes"])
     rows = report["sources"]
     if not rows:
-        return "No place is louder than before." if compares else "No source was found."
+        return "No source was found."
     first, count = rows[0], len(rows)
     place = f"at x {first['x_m']:.2f} m, y {first['y_m']:.2f} m"
-    if compares:
-        many = "One place is" if count == 1 else f"{count} places are"
-        return f"{many} louder than before; most of all {first['id']} {place}."
     many = "One source was found" if count == 1 else f"{count} sources were found"
     return f"{many}; the loudest, {first['id']}, {place}."
 
@@ -123,32 +124,43 @@ def _run_facts(report: Mapping[str, Any]) -> list[tuple[str, str, bool]]:
     way, rows = report["trajectory"], report["sources"]
     lost = sum(loss["data_lost"] for loss in report["losses"])
     share = way["usable_share"]
-    level = _number(rows[0]["power_db"], 1) if rows else NOTHING
+    level = number_text(rows[0]["power_db"], 1) if rows else NOTHING
     return [
-        (level, _printed(report["level_reference"]) + ", loudest source", False),
+        (level, printed_reference(report["level_reference"]) + ", loudest source", False),
         (str(len(rows)), "sources", False),
         (
             NOTHING if share is None else f"{100 * share:.1f} %",
             "of the poses can be trusted",
             share is None or share < 0.95,
         ),
-        (f"{way['length_m']:.1f} m", f"driven in {_number(report['duration_s'], 1)} s", False),
+        (f"{way['length_m']:.1f} m", f"driven in {number_text(report['duration_s'], 1)} s", False),
         (str(lost) if lost else "none", "kinds of data lost", lost > 0),
     ]
 
 
+def _lead_of_changes(rows: Sequence[Mapping[str, Any]]) -> str:
+    if not rows:
+        return "Nothing differs."
+    counts = Counter(row["kind"] for row in rows)
+    parts = [f"{counts[kind]} {kind}" for kind in KINDS if counts[kind]]
+    changed = any(counts[kind] for kind in KINDS[:4])
+    start = "What changed: " if changed else "Nothing changed for sure: "
+    return f"{start}{', '.join(parts)}."
+
+
 def _diff_facts(report: Mapping[str, Any]) -> list[tuple[str, str, bool]]:
-    rows, counts = report["sources"], report["counts"]
+    rows, counts = report["changes"], report["counts"]
+    kinds = Counter(row["kind"] for row in rows)
     without = counts.get("cells_without_background", 0)
     return [
+        (str(kinds["appeared"] + kinds["louder"]), "places louder", False),
+        (str(kinds["gone"] + kinds["quieter"]), "places quieter", False),
+        (str(kinds["unchanged"]), "unchanged", False),
         (
-            f"{_number(rows[0]['ratio_db'], 1)} dB" if rows else NOTHING,
-            "greatest difference",
-            False,
+            f"{counts.get('cells_compared', 0)}",
+            f"cells compared, {without} of them against the background's median",
+            without > 0,
         ),
-        (str(len(rows)), "places louder", False),
-        (str(counts.get("cells_compared", 0)), "cells compared", False),
-        (str(without), "of them against the background's median", without > 0),
     ]
 
 
@@ -168,17 +180,15 @@ def _figure(name: str, content: bytes) -> str:
     return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"
 
 
-def _sources(report: Mapping[str, Any]) -> str:
-    rows = report["sources"]
-    if not rows:
-        return "<p>None.</p>"
-    columns = [column for column in rows[0] if column not in HIDDEN]
-    reference = report.get("level_reference")
-    note = f"<p>Levels are in {escape(_printed(reference))}.</p>" if reference else ""
-    head = [HEADINGS.get(column, column) for column in columns]
-    cells = [[_cell(row.get(column)) for column in columns] for row in rows]
-    level = "power_db" if "power_db" in rows[0] else "ratio_db"
-    return level_plot(rows, level, _printed(reference or "dB")) + note + _table(head, cells)
+def _mirror_images(report: Mapping[str, Any]) -> list[str]:
+    return [_section("Mirror images", reflections_table(report))] if report["reflections"] else []
+
+
+def _what_was_lost(report: Mapping[str, Any], *, compares: bool) -> list[str]:
+    losses = report["losses"]
+    if compares:
+        return [_section("To be kept in mind", _losses(losses))] if losses else []
+    return [_section("What was lost", _losses(losses))]
 
 
 def _losses(losses: Sequence[Mapping[str, Any]]) -> str:
@@ -194,7 +204,7 @@ def _losses(losses: Sequence[Mapping[str, Any]]) -> str:
         ]
         for loss in losses
     ]
-    return _table(["", "Times", "What", "Where", "What was done"], rows)
+    return html_table(["", "Times", "What", "Where", "What was done"], rows)
 
 
 def _provenance(report: Mapping[str, Any]) -> str:
@@ -203,11 +213,11 @@ def _provenance(report: Mapping[str, Any]) -> str:
         if report.get(key) is not None:
             facts[_words(key)] = str(report[key])
     if report.get("duration_s") is not None:
-        facts["length of the log"] = f"{_number(report['duration_s'], 1)} s"
+        facts["length of the log"] = f"{number_text(report['duration_s'], 1)} s"
     if report.get("speed") is not None:
         facts["speed"] = f"{report['speed']:.3g} x real time"
     facts["time"] = _joined(
-        f"{_words(k)} {_number(v, 2)} s" for k, v in report["timings_s"].items()
+        f"{_words(k)} {number_text(v, 2)} s" for k, v in report["timings_s"].items()
     )
     facts["counts"] = _joined(f"{v} {_words(k)}" for k, v in report["counts"].items())
     facts["versions"] = _joined(f"{k} {v}" for k, v in report["versions"].items())
@@ -223,36 +233,9 @@ def _section(title: str, content: str) -> str:
     return f"<section><h2>{escape(title)}</h2>{content}</section>"
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    numeric = [all(_is_number(row[i]) for row in rows) for i in range(len(head))]
-    marks = [' class="n"' if number else "" for number in numeric]
-    titles = "".join(f"<th{m}>{escape(t)}</th>" for m, t in zip(marks, head, strict=True))
-    lines = "".join(
-        "<tr>"
-        + "".join(f"<td{m}>{escape(c)}</td>" for m, c in zip(marks, row, strict=True))
-        + "</tr>"
-        for row in rows
-    )
-    return f'<div class="wide"><table><tr>{titles}</tr>{lines}</table></div>'
-
-
 def _definitions(facts: Mapping[str, str]) -> str:
     lines = (f"<dt>{escape(k)}</dt><dd>{escape(v)}</dd>" for k, v in facts.items() if v)
     return f"<dl>{''.join(lines)}</dl>"
-
-
-def _cell(value: Any) -> str:
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    return NOTHING if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
-
-
-def _number(value: float | None, decimals: int) -> str:
-    return NOTHING if value is None else f"{value:.{decimals}f}"
-
-
-def _is_number(text: str) -> bool:
-    return text == NOTHING or text.replace(".", "", 1).replace("-", "", 1).isdigit()
 
 
 def _joined(parts: Iterable[str]) -> str:
@@ -261,7 +244,3 @@ def _joined(parts: Iterable[str]) -> str:
 
 def _words(name: str) -> str:
     return name.replace("_", " ")
-
-
-def _printed(reference: str) -> str:
-    return reference.replace("^2", "²").replace("uPa", "µPa")

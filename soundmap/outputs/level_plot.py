@@ -10,10 +10,9 @@ from typing import Any
 SHOWN_ROWS = 20
 WIDTH, ROW, LEFT, RIGHT = 560, 24, 46, 90
 STEPS_DB = (0.5, 1, 2, 5, 10, 20, 50)
-ERROR_SUFFIXES = ("_std_db", "_sigma_db")
 
 
-def level_plot(rows: Sequence[Mapping[str, Any]], level: str, unit: str) -> str:
+def level_plot(rows: Sequence[Mapping[str, Any]], level: str, error: str, unit: str) -> str:
     """An SVG drawing for a page, or nothing if no row has a level.
 
     Parameters
@@ -21,17 +20,18 @@ def level_plot(rows: Sequence[Mapping[str, Any]], level: str, unit: str) -> str:
     rows : sequence of mapping
         Of ``sources.csv``, loudest first.
     level : str
-        The column of the level [dB]; its standard deviation is the column of the same name with
-        ``_std_db`` or ``_sigma_db`` instead of ``_db``, if there is one.
+        The column of the level [dB].
+    error : str
+        The column of its standard error [dB], which need not be there.
     unit : str
         What stands at the scale.
     """
     shown = [row for row in rows[:SHOWN_ROWS] if row.get(level) is not None]
     if not shown:
         return ""
-    errors = [_error_db(row, level) for row in shown]
-    low = min(row[level] - error for row, error in zip(shown, errors, strict=True))
-    high = max(row[level] + error for row, error in zip(shown, errors, strict=True))
+    errors = [row.get(error) or 0.0 for row in shown]
+    low = min(row[level] - off for row, off in zip(shown, errors, strict=True))
+    high = max(row[level] + off for row, off in zip(shown, errors, strict=True))
     step = next((step for step in STEPS_DB if high - low <= 6 * step), 100)
     first, last = math.floor(low / step), math.floor(high / step) + 1
     span = (last - first) * step
@@ -41,14 +41,14 @@ def level_plot(rows: Sequence[Mapping[str, Any]], level: str, unit: str) -> str:
 
     bottom = ROW * len(shown) + 6
     parts = [_tick(at(n * step), bottom, f"{n * step:g}") for n in range(first, last + 1)]
-    for number, (row, error) in enumerate(zip(shown, errors, strict=True)):
+    for number, (row, off) in enumerate(zip(shown, errors, strict=True)):
         y = ROW * number + ROW // 2 + 2
         parts.append(_text(LEFT - 8, y, str(row["id"]), "end", bold=True))
-        if error > 0:
-            ends = f'x1="{at(row[level] - error):.1f}" x2="{at(row[level] + error):.1f}"'
+        if off > 0:
+            ends = f'x1="{at(row[level] - off):.1f}" x2="{at(row[level] + off):.1f}"'
             parts.append(f'<line {ends} y1="{y}" y2="{y}" stroke="#0072B2" stroke-width="2"/>')
         parts.append(f'<circle cx="{at(row[level]):.1f}" cy="{y}" r="5" fill="#0072B2"/>')
-        written = f"{row[level]:.1f} ± {error:.1f}" if error > 0 else f"{row[level]:.1f}"
+        written = f"{row[level]:.1f} ± {off:.1f}" if off > 0 else f"{row[level]:.1f}"
         parts.append(_text(WIDTH - RIGHT + 12, y, f"{written} dB", "start"))
     parts.append(_text((LEFT + WIDTH - RIGHT) / 2, bottom + 34, unit, "middle"))
     height = bottom + 46
@@ -59,15 +59,6 @@ def level_plot(rows: Sequence[Mapping[str, Any]], level: str, unit: str) -> str:
         f'<svg viewBox="0 0 {WIDTH} {height}" width="{WIDTH}" height="{height}" role="img" '
         f'font-size="13" font-family="system-ui, sans-serif">{title}{"".join(parts)}</svg>{note}'
     )
-
-
-def _error_db(row: Mapping[str, Any], level: str) -> float:
-    """Standard deviation of a level [dB], 0 if unknown."""
-    for suffix in ERROR_SUFFIXES:
-        error = row.get(level.removesuffix("_db") + suffix)
-        if error is not None:
-            return float(error)
-    return 0.0
 
 
 def _tick(x: float, bottom: int, label: str) -> str:

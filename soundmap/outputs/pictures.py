@@ -8,11 +8,11 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from soundmap.change import PowerRatio
 from soundmap.errors import OutputError
 from soundmap.grid import OccupancyGrid
 from soundmap.outputs.picture_format import PictureFormat
 from soundmap.run import Run
-from soundmap.sound import PowerRatio
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure  # slow to load: only where pictures are drawn

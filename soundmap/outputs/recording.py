@@ -16,14 +16,24 @@ import rerun as rr
 from matplotlib import colormaps
 from numpy.typing import ArrayLike, NDArray
 
+from soundmap.change import ChangeKind
 from soundmap.geometry import FloatArray
 from soundmap.grid import GridFrame, OccupancyGrid
-from soundmap.outputs.figures import not_below, shown_range
+from soundmap.outputs.figures import PALE, SURE, not_below, shown_range
 from soundmap.outputs.floor import Area, area_of_interest, cropped
 from soundmap.outputs.recording_layout import difference_layout, run_layout
+from soundmap.outputs.report import change_rows, source_rows
 from soundmap.outputs.stored_run import StoredDifference
+from soundmap.outputs.wording import (
+    chance_text,
+    ellipse_95,
+    flags_text,
+    level_text,
+    printed_reference,
+    ratio_text,
+)
 from soundmap.run import Run
-from soundmap.sound import PowerMap, decibels
+from soundmap.sound import PowerMap, SourceList, decibels
 
 APPLICATION = "soundmap"
 TIMELINE = "time"
@@ -31,7 +41,8 @@ FLOOR_Z, POWER_Z, LINE_Z = 0.0, 0.01, 0.03
 """Heights at which flat things are drawn, one above the other [m]."""
 WALL_RGBA, OPEN_RGBA, UNKNOWN_RGBA = (90, 95, 105, 255), (236, 238, 240, 255), (34, 38, 46, 255)
 BLUE, VERMILION, GREEN = (0, 114, 178), (213, 94, 0), (0, 158, 115)
-PURPLE, DARK, WHITE = (117, 70, 160), (40, 44, 52), (255, 255, 255)
+PURPLE, DARK, GREY = (117, 70, 160), (40, 44, 52), (130, 134, 142)
+WHITE = (255, 255, 255)
 SCANNER_COLOURS = MappingProxyType({0: (86, 180, 233), 1: (230, 159, 0), 2: (204, 121, 167)})
 LEAST_LOBE_M, GREATEST_LOBE_M = 0.25, 1.0
 """Radius at which the polar curve of an audio scan shows the quietest and the loudest level."""
@@ -117,12 +128,17 @@ class RunRecording:
     def _draw_results(self) -> None:
         run, stream = self._run, self._stream
         self._send_grid("/world/result/power", self._level, run.power_map.frame, None)
-        levels = [float(decibels(source.power)) for source in run.sources]
-        _draw_places(
-            stream,
-            [(source.x_m, source.y_m) for source in run.sources],
-            [f"S{n}  {level:.1f} dB" for n, level in enumerate(levels, start=1)],
-        )
+        rows = source_rows(run.sources)
+        places = [(source.x_m, source.y_m) for source in run.sources]
+        labels = [f"{row['id']}  {level_text(row)} dB" for row in rows]
+        remarks = map(flags_text, rows)
+        labels = [
+            f"{label} ({remark})" if remark else label
+            for label, remark in zip(labels, remarks, strict=True)
+        ]
+        _draw_places(stream, places, labels, [VERMILION] * len(places))
+        _draw_ellipses(stream, run.sources)
+        _draw_images(stream, run.sources)
 
     def _draw_trajectory(self) -> None:
         trajectory, stream = self._run.trajectory, self._stream
@@ -286,32 +302,40 @@ def write_difference_recording(difference: StoredDifference, file: Path) -> None
         if difference.room is not None:
             _draw_floor(stream, difference.room)
         reach = float(np.clip(np.nanmax(np.abs(ratio.ratio_db), initial=0.0), 3.0, 20.0))
-        part, (left, _, bottom, _) = cropped(
-            ratio.ratio_db, ratio.frame, _bounding_area(measured, ratio.frame)
-        )
+        shown = _bounding_area(measured, ratio.frame)
+        part, (left, _, bottom, _) = cropped(ratio.ratio_db, ratio.frame, shown)
         share = np.clip(part.astype(np.float64) / (2.0 * reach) + 0.5, 0.0, 1.0)
-        grid = _grid(_coloured(share, "RdBu_r"), ratio.frame.resolution_m, (left, bottom), POWER_Z)
+        rgba = _coloured(share, "RdBu_r")
+        if ratio.chance is not None:
+            sure, _ = cropped(ratio.chance < SURE, ratio.frame, shown)
+            rgba[~sure.astype(bool), 3] = (PALE * rgba[~sure.astype(bool), 3]).astype(np.uint8)
+        grid = _grid(rgba, ratio.frame.resolution_m, (left, bottom), POWER_Z)
         stream.log("/world/result/power_ratio", grid, static=True)
-        labels = [f"S{n}  {change.ratio_db:+.1f} dB" for n, change in enumerate(ratio.changes, 1)]
-        _draw_places(stream, places, labels)
+        labels = [
+            f"{row['id']}  {row['kind']}"
+            + ("" if change.kind == ChangeKind.UNTOLD else f"  {ratio_text(row)} dB")
+            for row, change in zip(change_rows(ratio.changes), ratio.changes, strict=True)
+        ]
+        _draw_places(stream, places, labels, [_change_colour(c.kind) for c in ratio.changes])
         text = difference_markdown(difference)
         stream.log("/summary", rr.TextDocument(text, media_type="text/markdown"), static=True)
 
 
 def run_markdown(run: Run) -> str:
     """What was found, in a few lines and a table."""
-    unit = str(run.sources.reference).replace("^2", "²").replace("uPa", "µPa")
+    unit = printed_reference(str(run.sources.reference))
     usable = f"{100 * run.trajectory.usable.mean():.1f} %" if len(run.trajectory) else "none"
     lines = [f"# {run.log.name}", "", f"{run.duration_s:.1f} s; {usable} of the poses trusted.", ""]
-    if len(run.sources):
-        lines += [f"| | x [m] | y [m] | level [{unit}] | visits |", "|---|--:|--:|--:|--:|"]
+    rows = source_rows(run.sources)
+    if rows:
+        lines += [f"| | x [m] | y [m] | level [{unit}] | visits | |", "|---|--:|--:|--:|--:|---|"]
     else:
         lines.append("No source was found.")
-    for number, source in enumerate(run.sources, start=1):
-        level = f"{float(decibels(source.power)):.1f}"
-        lines.append(
-            f"| S{number} | {source.x_m:.2f} | {source.y_m:.2f} | {level} | {source.visits} |"
-        )
+    lines += [
+        f"| {row['id']} | {row['x_m']:.2f} | {row['y_m']:.2f} | {level_text(row)} "
+        f"| {row['visits']} | {flags_text(row)} |"
+        for row in rows
+    ]
     lines += ["", "**Lost or noted**", ""]
     lines += [f"- {loss.count} x {loss.what} ({loss.where}): {loss.effect}" for loss in run.losses]
     return "\n".join(lines if run.losses else [*lines, "Nothing."])
@@ -320,13 +344,17 @@ def run_markdown(run: Run) -> str:
 def difference_markdown(difference: StoredDifference) -> str:
     """What changed, in a table."""
     lines = [f"# {difference.title}", ""]
-    if difference.ratio.changes:
-        lines += ["| | x [m] | y [m] | louder by [dB] | visits |", "|---|--:|--:|--:|--:|"]
+    rows = change_rows(difference.ratio.changes)
+    if rows:
+        head = "| | change | x [m] | y [m] | louder by [dB] | by chance |"
+        lines += [head, "|---|---|--:|--:|--:|--:|"]
     else:
-        lines.append("No place is louder than before.")
-    for number, change in enumerate(difference.ratio.changes, start=1):
-        place = f"{change.x_m:.2f} | {change.y_m:.2f}"
-        lines.append(f"| S{number} | {place} | {change.ratio_db:.1f} | {change.visits} |")
+        lines.append("Nothing differs.")
+    lines += [
+        f"| {row['id']} | {row['kind']} | {row['x_m']:.2f} | {row['y_m']:.2f} "
+        f"| {ratio_text(row)} | {chance_text(row['false_alarm_probability'])} |"
+        for row in rows
+    ]
     return "\n".join(lines)
 
 
@@ -348,23 +376,61 @@ def _draw_robot(stream: rr.RecordingStream) -> None:
 
 
 def _draw_places(
-    stream: rr.RecordingStream, places_m: Sequence[tuple[float, float]], labels: Sequence[str]
+    stream: rr.RecordingStream,
+    places_m: Sequence[tuple[float, float]],
+    labels: Sequence[str],
+    colours: Sequence[tuple[int, int, int]],
 ) -> None:
     """Labelled points on the floor, static; an empty list draws nothing."""
     if not places_m:
         return
     at = _raised(_places(places_m), 4.0 * LINE_Z)
-    dots = rr.Points3D(at, colors=[VERMILION], radii=rr.Radius.ui_points(2.5))
+    dots = rr.Points3D(at, colors=list(colours), radii=rr.Radius.ui_points(2.5))
     stream.log("/world/result/sources", dots, static=True)
     rings = rr.LineStrips3D(
         list(_circle(RING_M) + at[:, None, :]),
-        colors=[VERMILION],
+        colors=list(colours),
         radii=rr.Radius.ui_points(1.5),
     )
     stream.log("/world/result/source_rings", rings, static=True)
     # a label has the colour of its point: white ones are read best, and need no dot
-    names = rr.Points3D(at, colors=[WHITE], radii=[0.0], labels=labels, show_labels=True)
+    names = rr.Points3D(at, colors=[WHITE], radii=[0.0], labels=list(labels), show_labels=True)
     stream.log("/world/result/source_labels", names, static=True)
+
+
+def _draw_ellipses(stream: rr.RecordingStream, sources: SourceList) -> None:
+    """Where the sources lie with 95 %, as far as that is known."""
+    lines = [
+        _raised(np.array([source.x_m, source.y_m]) + ellipse_95(source.fit.covariance_m2), 0.13)
+        for source in sources
+        if source.fit is not None
+    ]
+    if lines:
+        ellipses = rr.LineStrips3D(lines, colors=[VERMILION], radii=rr.Radius.ui_points(1.0))
+        stream.log("/world/result/source_ellipses", ellipses, static=True)
+
+
+def _draw_images(stream: rr.RecordingStream, sources: SourceList) -> None:
+    """Mirror images, each with a line to its source if that is known."""
+    images = sources.reflections
+    if not images:
+        return
+    at = _raised(_places([(image.x_m, image.y_m) for image in images]), 4.0 * LINE_Z)
+    dots = rr.Points3D(at, colors=[GREY], radii=rr.Radius.ui_points(3.0))
+    stream.log("/world/result/mirror_images", dots, static=True)
+    owners = [None if image.source is None else sources.sources[image.source] for image in images]
+    lines = [
+        np.array([place, [source.x_m, source.y_m, 4.0 * LINE_Z]])
+        for place, source in zip(at, owners, strict=True)
+        if source is not None
+    ]
+    if lines:
+        strips = rr.LineStrips3D(lines, colors=[GREY], radii=rr.Radius.ui_points(0.7))
+        stream.log("/world/result/mirror_lines", strips, static=True)
+
+
+def _change_colour(kind: ChangeKind) -> tuple[int, int, int]:
+    return VERMILION if kind.is_louder else BLUE if kind.is_quieter else GREY
 
 
 def _grid(

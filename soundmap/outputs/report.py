@@ -16,10 +16,12 @@ from typing import Any
 import numpy as np
 
 from soundmap import __version__
+from soundmap.change import Change, PowerRatio
 from soundmap.config import DiffConfig
 from soundmap.geometry import Trajectory
+from soundmap.losses import Loss
 from soundmap.run import Run
-from soundmap.sound import Change, PowerRatio, Source, SourceList, decibels
+from soundmap.sound import Source, SourceList, decibels
 
 SCHEMA_VERSION = 1
 SOURCE_COLUMNS = (
@@ -28,7 +30,10 @@ SOURCE_COLUMNS = (
     "flags",
 )  # fmt: skip
 REFLECTION_COLUMNS = ("id", "x_m", "y_m", "level_1m_db", "source")
-CHANGE_COLUMNS = ("id", "x_m", "y_m", "ratio_db", "visits")
+CHANGE_COLUMNS = (
+    "id", "x_m", "y_m", "ratio_db", "visits", "kind", "ratio_sigma_db", "false_alarm_probability",
+    "id_in_run", "id_in_background",
+)  # fmt: skip
 LIBRARIES = ("numpy", "scipy", "numba", "matplotlib", "mcap", "rosbags", "pydantic", "rerun-sdk")
 
 
@@ -67,14 +72,18 @@ def diff_report(
     background: Path,
     config: DiffConfig,
     timings_s: Mapping[str, float],
+    notes: Sequence[Loss] = (),
 ) -> dict[str, Any]:
     """Everything about a comparison of two runs but its arrays."""
     measured = np.isfinite(ratio.ratio_db)
+    rows = change_rows(ratio.changes)
     return {
         **provenance(),
         "run": run.resolve().name,
         "background": background.resolve().name,
-        "sources": change_rows(ratio.changes),
+        "sources": rows[: len(ratio.louder)],
+        "changes": rows,
+        "losses": [dataclasses.asdict(note) for note in notes],
         "counts": {
             "cells_compared": int(measured.sum()),
             "cells_without_background": int((measured & ~ratio.background_measured).sum()),
@@ -108,7 +117,7 @@ def reflection_rows(sources: SourceList) -> list[dict[str, Any]]:
             "x_m": round(image.x_m, 4),
             "y_m": round(image.y_m, 4),
             "level_1m_db": _finite(round(float(decibels(image.power)), 3)),
-            "source": "" if image.source is None else f"S{image.source + 1}",
+            "source": _name(image.source),
         }
         for number, image in enumerate(sources.reflections, start=1)
     ]
@@ -125,14 +134,14 @@ def _fit_row(source: Source) -> dict[str, Any]:
         "var_x_m2": round(var_x, 7),
         "cov_xy_m2": round(cov_xy, 7),
         "var_y_m2": round(var_y, 7),
-        "false_alarm_probability": float(f"{fit.false_alarm_probability:.3g}"),
+        "false_alarm_probability": _three_digits(fit.false_alarm_probability),
         "arc_deg": round(math.degrees(fit.arc_rad), 1),
         "flags": " ".join(fit.flags),
     }
 
 
 def change_rows(changes: Sequence[Change]) -> list[dict[str, Any]]:
-    """One row a change, greatest ratio first, named S1, S2, ..."""
+    """One row a change, named S1, S2, ... in the order given; missing values are None."""
     return [
         {
             "id": f"S{number}",
@@ -140,9 +149,22 @@ def change_rows(changes: Sequence[Change]) -> list[dict[str, Any]]:
             "y_m": round(change.y_m, 4),
             "ratio_db": _finite(round(change.ratio_db, 3)),
             "visits": change.visits,
+            "kind": str(change.kind),
+            "ratio_sigma_db": None if change.sigma_db is None else round(change.sigma_db, 3),
+            "false_alarm_probability": _three_digits(change.false_alarm_probability),
+            "id_in_run": _name(change.run_source),
+            "id_in_background": _name(change.background_source),
         }
         for number, change in enumerate(changes, start=1)
     ]
+
+
+def _three_digits(value: float | None) -> float | None:
+    return None if value is None else float(f"{value:.3g}")
+
+
+def _name(source: int | None) -> str:
+    return "" if source is None else f"S{source + 1}"
 
 
 def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:

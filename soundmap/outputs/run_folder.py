@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,9 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from soundmap.change import PowerRatio
 from soundmap.config import DiffConfig, config_toml
 from soundmap.geometry import FloatArray, Trajectory
 from soundmap.grid import GridFrame, OccupancyGrid
+from soundmap.losses import Loss
 from soundmap.map_file import map_files
 from soundmap.outputs.html_report import report_html
 from soundmap.outputs.new_folder import REPORT, writing
@@ -31,7 +33,7 @@ from soundmap.outputs.report import (
     run_report,
 )
 from soundmap.run import Run
-from soundmap.sound import AudioScans, PowerMap, PowerRatio
+from soundmap.sound import AudioScans, PowerMap
 
 
 def write_run(
@@ -79,6 +81,7 @@ def write_diff(
     background: Path,
     config: DiffConfig,
     timings_s: Mapping[str, float],
+    notes: Sequence[Loss] = (),
     figures: PictureFormat = PictureFormat.PNG,
 ) -> dict[str, Any]:
     """Write the difference of two runs into an empty folder.
@@ -94,6 +97,8 @@ def write_diff(
     config : DiffConfig
     timings_s : mapping
         Wall time of each stage so far [s].
+    notes : sequence of Loss
+        Why the two runs may not compare like with like.
     figures : PictureFormat
         How to write the picture, if at all.
 
@@ -116,7 +121,10 @@ def write_diff(
             background=background,
             config=config,
             timings_s={**timings_s, "outputs": time.perf_counter() - start},
+            notes=notes,
         )
+        every = csv_text(CHANGE_COLUMNS, report["changes"])
+        (folder / "changes.csv").write_text(every, encoding="utf-8")
         _write_report(folder, CHANGE_COLUMNS, report, shown)
     return report
 
@@ -146,11 +154,13 @@ def tum_text(trajectory: Trajectory) -> str:
 
 def power_map_arrays(power_map: PowerMap, *, min_visit_share: float) -> dict[str, ArrayLike]:
     """Content of ``power_map.npz``: what people read, and the sums that merge exactly."""
+    squares = {} if power_map.square_sum is None else {"square_sum": power_map.square_sum}
     return {
         "power": power_map.power(min_visit_share=min_visit_share),
         "visits": power_map.visits,
         **_frame_arrays(power_map.frame),
         "power_sum": power_map.power_sum,
+        **squares,
         "min_visit_share": min_visit_share,
         "reference": str(power_map.reference),
         "power_unit": str(power_map.reference).removeprefix("dB re "),
@@ -200,10 +210,12 @@ def _trajectory_arrays(trajectory: Trajectory) -> dict[str, ArrayLike]:
 
 
 def _power_ratio_arrays(ratio: PowerRatio) -> dict[str, ArrayLike]:
+    chance = {} if ratio.chance is None else {"chance": ratio.chance}
     return {
         "ratio_db": ratio.ratio_db,
         "visits": ratio.visits,
         "background_measured": ratio.background_measured,
+        **chance,
         **_frame_arrays(ratio.frame),
         "schema_version": SCHEMA_VERSION,
     }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import zipfile
 import zlib
 from collections.abc import Callable, Mapping
@@ -13,6 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from soundmap.change import Change, ChangeKind, PowerRatio
 from soundmap.config import loaded_config
 from soundmap.errors import LogError
 from soundmap.geometry import Mount, Trajectory
@@ -24,11 +26,11 @@ from soundmap.outputs.report import SCHEMA_VERSION
 from soundmap.run import Run
 from soundmap.sound import (
     AudioScans,
-    Change,
     LevelReference,
     PowerMap,
-    PowerRatio,
+    Reflection,
     Source,
+    SourceFit,
     SourceList,
 )
 
@@ -36,6 +38,7 @@ MAX_ARCHIVE_BYTES = 2 * 2**30
 """An archive that expands to more than this is not one of a run."""
 
 POWER_MAP, POWER_RATIO = "power_map.npz", "power_ratio.npz"
+AUDIO_SCANS, TRAJECTORY = "audio_scans.npz", "trajectory.npz"
 
 Stored = Mapping[str, NDArray[Any]]
 _Content = TypeVar("_Content")
@@ -65,20 +68,10 @@ def read_run(folder: Path) -> Run:
         Not a run folder, a damaged one, or one of a newer soundmap.
     """
     power_map, _ = read_power_map(folder)
-    scans = _read(folder, "audio_scans.npz", _audio_scans)
-    trajectory = _read(folder, "trajectory.npz", _trajectory)
+    scans = _read(folder, AUDIO_SCANS, _audio_scans)
+    trajectory = _read(folder, TRAJECTORY, _trajectory)
     report = read_report(folder)
     try:
-        reference = LevelReference(report["level_reference"])
-        sources = tuple(
-            Source(
-                float(row["x_m"]),
-                float(row["y_m"]),
-                0.0 if row["power_db"] is None else 10.0 ** (row["power_db"] / 10.0),
-                int(row["visits"]),
-            )
-            for row in report["sources"]
-        )
         return Run(
             log=Path(report["log_path"]),
             fingerprint=report["fingerprint"],
@@ -87,7 +80,7 @@ def read_run(folder: Path) -> Run:
             trajectory=trajectory,
             scans=scans,
             power_map=power_map,
-            sources=SourceList(sources, reference),
+            sources=_source_list(report),
             losses=tuple(Loss(**loss) for loss in report["losses"]),
             counts=report["counts"],
             timings_s=report["timings_s"],
@@ -95,6 +88,17 @@ def read_run(folder: Path) -> Run:
         )
     except (KeyError, TypeError, ValueError) as error:
         raise _damaged(folder / REPORT, f"{error!r}") from None
+
+
+def tells_of_sources(folder: Path) -> bool:
+    """Whether a run folder has sources of a fit, and all that they can be judged by."""
+    needed = [folder / name for name in (REPORT, AUDIO_SCANS, TRAJECTORY, "config.toml")]
+    if not all(file.is_file() for file in needed):
+        return False
+    report = read_report(folder)
+    method = report.get("config", {}).get("detect", {}).get("method")
+    scans = _read(folder, AUDIO_SCANS, _audio_scans)
+    return method == "sparse" and scans.mount is not None and "reflections" in report
 
 
 @dataclass(frozen=True)
@@ -125,15 +129,7 @@ def read_difference(folder: Path) -> StoredDifference:
     """
     report = read_report(folder)
     try:
-        changes = tuple(
-            Change(
-                float(row["x_m"]),
-                float(row["y_m"]),
-                np.nan if row["ratio_db"] is None else float(row["ratio_db"]),
-                int(row["visits"]),
-            )
-            for row in report["sources"]
-        )
+        changes = tuple(map(_change, report.get("changes", report["sources"])))
         title = f"{report['run']} against {report['background']}"
     except (KeyError, TypeError, ValueError) as error:
         raise _damaged(folder / REPORT, f"{error!r}") from None
@@ -141,7 +137,8 @@ def read_difference(folder: Path) -> StoredDifference:
     def ratio(stored: Stored) -> PowerRatio:
         level = stored["ratio_db"].astype(np.float64)
         measured = stored["background_measured"].astype(bool)
-        return PowerRatio(_frame(stored, level), level, stored["visits"], measured, changes)
+        chance = stored["chance"].astype(np.float64) if "chance" in stored else None
+        return PowerRatio(_frame(stored, level), level, stored["visits"], measured, changes, chance)
 
     map_yaml = folder / "map.yaml"
     room = read_map(map_yaml) if map_yaml.is_file() else None
@@ -213,7 +210,10 @@ def _power_map(stored: Stored) -> PowerMap:
         raise ValueError("sums should be finite and visits not negative")
     reference = LevelReference(str(stored["reference"]))
     frame = _frame(stored, visits)
-    return PowerMap(frame, power_sum.astype(np.float64), visits.astype(np.int64), reference)
+    squares = stored["square_sum"].astype(np.float64) if "square_sum" in stored else None
+    return PowerMap(
+        frame, power_sum.astype(np.float64), visits.astype(np.int64), reference, squares
+    )
 
 
 def _audio_scans(stored: Stored) -> AudioScans:
@@ -227,6 +227,64 @@ def _audio_scans(stored: Stored) -> AudioScans:
         parts = stored["sub_band_power"]
         edges = tuple(float(edge) for edge in stored["sub_band_hz"])
     return AudioScans(time_ns, bearing, stored["power"], reference, mount, parts, edges)
+
+
+def _source_list(report: Mapping[str, Any]) -> SourceList:
+    sources = tuple(
+        Source(
+            float(row["x_m"]),
+            float(row["y_m"]),
+            _power(row["power_db"]),
+            int(row["visits"]),
+            _fit(row),
+        )
+        for row in report["sources"]
+    )
+    images = tuple(
+        Reflection(
+            float(row["x_m"]), float(row["y_m"]), _power(row["level_1m_db"]), _index(row["source"])
+        )
+        for row in report.get("reflections", ())
+    )
+    return SourceList(sources, LevelReference(report["level_reference"]), images)
+
+
+def _fit(row: Mapping[str, Any]) -> SourceFit | None:
+    """What a fit told of a source; None where its row tells of none."""
+    if row.get("var_x_m2") is None:
+        return None
+    covariance = [[row["var_x_m2"], row["cov_xy_m2"]], [row["cov_xy_m2"], row["var_y_m2"]]]
+    return SourceFit(
+        _power(row["level_1m_db"]),
+        np.array(covariance, dtype=np.float64),
+        float(row["false_alarm_probability"]),
+        math.radians(row["arc_deg"]),
+        tuple(row["flags"].split()),
+    )
+
+
+def _change(row: Mapping[str, Any]) -> Change:
+    """A row of a difference; in older folders it told of no kind, and only of louder places."""
+    return Change(
+        float(row["x_m"]),
+        float(row["y_m"]),
+        math.nan if row["ratio_db"] is None else float(row["ratio_db"]),
+        int(row["visits"]),
+        ChangeKind(row.get("kind", ChangeKind.LOUDER)),
+        row.get("ratio_sigma_db"),
+        row.get("false_alarm_probability"),
+        _index(row.get("id_in_run", "")),
+        _index(row.get("id_in_background", "")),
+    )
+
+
+def _power(level_db: float | None) -> float:
+    return 0.0 if level_db is None else float(10.0 ** (level_db / 10.0))
+
+
+def _index(name: str) -> int | None:
+    """Index of a source from its name: 0 for S1."""
+    return int(name.removeprefix("S")) - 1 if name else None
 
 
 def _trajectory(stored: Stored) -> Trajectory:

@@ -11,6 +11,16 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from soundmap.outputs.wording import (
+    NOTHING,
+    chance_text,
+    flags_text,
+    level_text,
+    number_text,
+    place_error_text,
+    ratio_text,
+)
+
 SHOWN_ROWS = 10
 
 
@@ -43,13 +53,10 @@ def run_view(report: Mapping[str, Any]) -> RenderableType:
 
 def diff_view(report: Mapping[str, Any]) -> RenderableType:
     """Changes and files of a difference of two runs."""
-    changes = _table("id", align_right=("x [m]", "y [m]", "louder by [dB]", "visits"))
-    nothing = Text("\n  no place is louder than before\n")
-    found = _filled(changes, report["sources"], "ratio_db") if report["sources"] else nothing
     counts = report["counts"]
     return Group(
         Text(f"{report['run']} against {report['background']}"),
-        found,
+        _change_table(report["changes"]),
         _lines(
             {
                 "Cells": f"{counts['cells_compared']} compared, "
@@ -58,6 +65,7 @@ def diff_view(report: Mapping[str, Any]) -> RenderableType:
                 "Files": f"{report['folder']}/, to begin with report.html",
             }
         ),
+        *(_losses(report["losses"]) if report["losses"] else ()),
     )
 
 
@@ -115,7 +123,7 @@ def log_view(summary: Mapping[str, Any]) -> RenderableType:
         topics.add_row(
             Text(topic["name"], overflow="fold"),
             str(topic["messages"]),
-            _number(topic["rate_hz"], 1),
+            number_text(topic["rate_hz"], 1),
             Text(topic["schema"], overflow="fold"),
             topic["kind"] if topic["used"] else "-",
         )
@@ -142,21 +150,39 @@ def log_view(summary: Mapping[str, Any]) -> RenderableType:
 
 
 def _source_table(report: Mapping[str, Any]) -> RenderableType:
-    if not report["sources"]:
+    rows = report["sources"]
+    if not rows:
         return Text("\n  no sources found\n")
-    level = f"level [{report['level_reference']}]"
-    table = _table("id", align_right=("x [m]", "y [m]", level, "visits"))
-    return _filled(table, report["sources"], "power_db")
+    fitted = any(place_error_text(row) != NOTHING for row in rows)
+    flagged = any(flags_text(row) for row in rows)
+    right = ["x [m]", "y [m]", *(["95 % [cm]"] if fitted else []), "level [dB]", "visits"]
+    table = _table("id", align_right=right, left=["remarks"] if flagged else [])
+    for row in rows[:SHOWN_ROWS]:
+        cells = [row["id"], f"{row['x_m']:.3f}", f"{row['y_m']:.3f}"]
+        cells += [place_error_text(row)] if fitted else []
+        cells += [level_text(row), str(row["visits"])]
+        table.add_row(*cells, *([flags_text(row)] if flagged else []))
+    note = f"  levels in {report['level_reference']}"
+    note += ", 95 %: half the axes of the ellipse" if fitted else ""
+    return Group(table, Text(f"{note}{_more(rows, 'sources.csv')}\n"))
 
 
-def _filled(table: Table, rows: Sequence[Mapping[str, Any]], level: str) -> RenderableType:
-    """The table with the loudest places."""
+def _change_table(rows: Sequence[Mapping[str, Any]]) -> RenderableType:
+    if not rows:
+        return Text("\n  nothing differs\n")
+    right = ("x [m]", "y [m]", "louder by [dB]", "by chance")
+    table = _table("id", align_right=right, left=("change",))
     for row in rows[:SHOWN_ROWS]:
         place = (f"{row['x_m']:.3f}", f"{row['y_m']:.3f}")
-        table.add_row(row["id"], *place, _number(row[level], 1), str(row["visits"]))
-    if (more := len(rows) - SHOWN_ROWS) > 0:
-        return Group(table, Text(f"  and {more} more in sources.csv\n"))
-    return table
+        chance = chance_text(row.get("false_alarm_probability"))
+        table.add_row(row["id"], *place, ratio_text(row), chance, row["kind"])
+    more = _more(rows, "changes.csv")
+    return Group(table, Text(f" {more}\n")) if more else table
+
+
+def _more(rows: Sequence[Mapping[str, Any]], file: str) -> str:
+    more = len(rows) - SHOWN_ROWS
+    return f" and {more} more in {file}" if more > 0 else ""
 
 
 def _losses(losses: Sequence[Mapping[str, Any]]) -> list[RenderableType]:
@@ -221,7 +247,3 @@ def _counts(report: Mapping[str, Any]) -> list[tuple[str, int]]:
 
 def _words(name: str) -> str:
     return name.replace("_", " ")
-
-
-def _number(value: float | None, decimals: int) -> str:
-    return "-" if value is None else f"{value:.{decimals}f}"

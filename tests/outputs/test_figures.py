@@ -3,7 +3,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from handmade import heard_map, made_ratio, made_run, round_trip, unlucky_run, walled_room
+from handmade import (
+    fitted_run,
+    heard_map,
+    made_ratio,
+    made_run,
+    round_trip,
+    unlucky_run,
+    walled_room,
+)
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage, imread
 
@@ -98,6 +106,39 @@ def test_cells_without_a_background_of_their_own_are_marked():
     assert not [line for line in figure.axes[0].lines if "median" in str(line.get_label())]
 
 
+def test_what_is_not_significant_is_pale():
+    ratio = made_ratio()
+    chance = np.full(ratio.ratio_db.shape, np.nan)
+    chance[5, 5:8] = 0.5, 0.001, 0.02
+    figure = power_ratio_figure(replace(ratio, chance=chance), room=None, title="a against b")
+    alpha = figure.axes[0].images[-1].get_alpha()
+    assert (alpha == 1.0).sum() == 1
+    assert set(np.unique(alpha)) == {0.3, 1.0}
+    plain = power_ratio_figure(ratio, room=None, title="a against b")
+    assert plain.axes[0].images[-1].get_alpha() is None
+
+
+def test_kinds_of_change_have_marks_of_their_own():
+    figure = power_ratio_figure(made_ratio(), room=walled_room(), title="run1 against run3")
+    assert {"appeared", "louder", "gone", "unchanged"} <= set(legend(figure))
+    (louder,) = (c for c in figure.axes[0].collections if c.get_label() == "louder")
+    red, _, blue, _ = louder.get_facecolor()[0]
+    assert red > blue
+    assert louder.get_offsets()[0].tolist() == [5.725, 3.375]
+
+
+def test_uncertain_places_are_drawn_with_their_ellipses_and_remarks():
+    figure = trajectory_figure(fitted_run())
+    assert legend(figure)[-4:] == ["mirror image", "95 %", "found here", "found here, with remarks"]
+    assert {"S1", "S2*"} <= texts(figure)
+    (ellipses,) = (c for c in figure.axes[0].collections if c.get_label() == "95 %")
+    (line,) = ellipses.get_segments()
+    reach = np.abs(line - [5.7251234, 3.375]).max(axis=0)
+    assert reach == pytest.approx(np.sqrt(5.991) * np.array([0.12, 0.05]), rel=1e-3)
+    (images,) = (c for c in figure.axes[0].collections if c.get_label() == "mirror image")
+    assert images.get_offsets().tolist() == [[3.1, -0.4]]
+
+
 def test_a_small_ratio_is_not_blown_up_to_full_colours():
     ratio = made_ratio()
     quiet = replace(ratio, ratio_db=np.clip(ratio.ratio_db, -0.5, 0.5), changes=())
@@ -182,9 +223,8 @@ def test_nothing_written_is_clipped_or_overlaps(width_m, height_m):
 
 def test_the_truth_is_drawn_as_crosses_inside_the_picture():
     figure = power_map_figure(made_run(), truth=[(3.0, 0.3), (11.0, 3.0)])
-    (crosses,) = (line for line in figure.axes[0].lines if line.get_label() == "truth")
-    assert crosses.get_marker() == "x"
-    assert crosses.get_xydata().tolist() == [[3.0, 0.3], [11.0, 3.0]]
+    (crosses,) = (c for c in figure.axes[0].collections if c.get_label() == "truth")
+    assert crosses.get_offsets().tolist() == [[3.0, 0.3], [11.0, 3.0]]
     assert figure.axes[0].get_xlim()[1] > 11.0
     assert "truth" not in legend(power_map_figure(made_run()))
 

@@ -2,7 +2,7 @@ import re
 from html.parser import HTMLParser
 
 import pytest
-from handmade import made_ratio, made_run, unlucky_run
+from handmade import fitted_run, made_ratio, made_run, unlucky_run
 
 from soundmap.config import DiffConfig
 from soundmap.outputs.html_report import report_html
@@ -54,10 +54,16 @@ def page_of(run) -> Page:
 def test_the_page_says_what_was_found_what_was_lost_and_how_it_was_made():
     page = page_of(made_run())
     assert page.says("2 sources were found; the loudest, S1, at x 3.12 m, y 0.28 m.")
-    assert page.says("S2", "5.7251", "-63.979", "dB re (full scale)²")
+    assert page.says("S2", "5.725", "-64.0", "dB re (full scale)²")
     assert page.says("90.0 %", "of the poses can be trusted")
     assert page.says("1294", "odometry pose is not finite", "motion taken from the twist")
     assert page.says("numpy", "localize 1.25 s", "min_visit_share = 0.1", "0123abcd")
+
+
+def test_the_page_tells_what_a_fit_knows():
+    page = page_of(fitted_run())
+    assert page.says("95 % within [cm]", "29 x 12", "not seen by laser, unsteady", "0.004")
+    assert page.says("Mirror images", "R1", "-80.0")
 
 
 def test_the_page_loads_nothing_but_itself():
@@ -100,8 +106,10 @@ def test_a_difference_has_a_page(tmp_path):
         timings_s={"compare": 0.1},
     )
     page = Page(report_html(report, {"power_ratio": b"\x89PNG"}))
-    assert page.says("run1 against run3", "2 places are louder than before; most of all S1")
-    assert page.says("against the background's median", "26.02")
+    assert page.says(
+        "run1 against run3", "What changed: 1 appeared, 1 louder, 1 gone, 1 unchanged."
+    )
+    assert page.says("against the background's median", "≥ +26.0", "+19.9 ± 0.4", "< 1e-06")
 
 
 def circles(svg: str) -> list[float]:
@@ -110,7 +118,7 @@ def circles(svg: str) -> list[float]:
 
 def test_the_dots_stand_where_the_scale_says():
     rows = [{"id": "S1", "power_db": 52.0}, {"id": "S2", "power_db": 46.0}]
-    svg = level_plot(rows, "power_db", "dB")
+    svg = level_plot(rows, "power_db", "level_sigma_db", "dB")
     ticks = {
         float(value): float(x)
         for x, value in re.findall(r'<text x="([0-9.]+)"[^>]*middle">(-?[0-9.]+)</text>', svg)
@@ -119,8 +127,8 @@ def test_the_dots_stand_where_the_scale_says():
 
 
 def test_a_known_error_is_drawn_to_both_sides_of_its_level():
-    row = {"id": "S1", "power_db": 50.0, "power_std_db": 2.0}
-    svg = level_plot([row], "power_db", "dB")
+    row = {"id": "S1", "power_db": 50.0, "level_sigma_db": 2.0}
+    svg = level_plot([row], "power_db", "level_sigma_db", "dB")
     start, end = map(float, re.search(r'<line x1="([0-9.]+)" x2="([0-9.]+)" y1="14"', svg).groups())
     assert (start + end) / 2 == pytest.approx(circles(svg)[0], abs=0.1)
     assert end - start > 10
@@ -128,12 +136,12 @@ def test_a_known_error_is_drawn_to_both_sides_of_its_level():
 
 
 def test_a_level_that_is_not_known_has_no_dot():
-    assert level_plot([{"id": "S1", "power_db": None}], "power_db", "dB") == ""
-    assert level_plot([], "power_db", "dB") == ""
+    assert level_plot([{"id": "S1", "power_db": None}], "power_db", "sigma", "dB") == ""
+    assert level_plot([], "power_db", "sigma", "dB") == ""
 
 
 def test_many_sources_are_cut_short_and_said_so():
     rows = [{"id": f"S{n}", "power_db": -float(n)} for n in range(30)]
-    svg = level_plot(rows, "power_db", "dB")
+    svg = level_plot(rows, "power_db", "level_sigma_db", "dB")
     assert len(circles(svg)) == 20
     assert "and 10 more" in svg

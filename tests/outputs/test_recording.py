@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rerun as rr
-from handmade import START_NS, made_ratio, made_run, unlucky_run, walled_room
+from handmade import START_NS, fitted_run, made_ratio, made_run, unlucky_run, walled_room
 from rerun.chunk import RrdReader
 
 from soundmap.geometry import Mount
@@ -216,7 +216,13 @@ def test_a_difference_has_a_recording(tmp_path):
     write_difference_recording(difference, tmp_path / "diff.rrd")
     recorded = Recorded(tmp_path / "diff.rrd")
     points = np.array(recorded.values("/world/result/sources", "positions")[0])
-    assert points[:, :2] == pytest.approx(np.array([[3.125, 0.275], [5.725, 3.375]]))
+    assert points[:2, :2] == pytest.approx(np.array([[3.125, 0.275], [5.725, 3.375]]))
+    labels = recorded.values("/world/result/source_labels", "labels")[0]
+    assert labels[:3] == [
+        "S1  appeared  ≥ +26.0 dB",
+        "S2  louder  +19.9 ± 0.4 dB",
+        "S3  gone  ≤ -14.0 dB",
+    ]
     picture = recorded.picture("/world/result/power_ratio")[::-1]
     ratio = made_ratio()
     np.testing.assert_array_equal(picture[..., 3] > 0, np.isfinite(ratio.ratio_db))
@@ -226,16 +232,32 @@ def test_a_difference_has_a_recording(tmp_path):
     assert blue[2] > blue[0]
 
 
+def test_what_a_fit_tells_is_drawn(tmp_path):
+    with run_recording(fitted_run(), tmp_path / "run.rrd"):
+        pass
+    recorded = Recorded(tmp_path / "run.rrd")
+    labels = recorded.values("/world/result/source_labels", "labels")[0]
+    assert labels == ["S1  -64.0 dB", "S2  -70.0 dB (not seen by laser, unsteady)"]
+    ellipse = np.array(recorded.values("/world/result/source_ellipses", "strips")[0][1])
+    reach = np.abs(ellipse[:, :2] - ellipse[:-1, :2].mean(axis=0)).max(axis=0)
+    assert reach == pytest.approx(np.sqrt(5.991) * np.array([0.12, 0.05]), rel=0.02)
+    images = np.array(recorded.values("/world/result/mirror_images", "positions")[0])
+    assert images[:, :2] == pytest.approx(np.array([[3.1, -0.4], [9.0, 9.0]]))
+    assert len(recorded.values("/world/result/mirror_lines", "strips")[0]) == 1
+
+
 def test_the_summary_tells_sources_and_losses(run):
     text = run_markdown(run)
-    assert "| S2 | 5.73 | 3.38 | -70.0 | 17 |" in text
+    assert "| S2 | 5.73 | 3.38 | -70.0 | 17 | |" in text.replace("  |", " |")
     assert "1294 x odometry pose is not finite" in text
     assert "level [dB re (full scale)²]" in text
     assert "Nothing." in run_markdown(unlucky_run())
 
 
-def test_the_summary_of_a_difference_tells_what_is_louder():
+def test_the_summary_of_a_difference_tells_what_changed():
     difference = StoredDifference(made_ratio(), None, "a against b")
-    assert "| S1 | 3.12 | 0.28 | 26.0 | 22 |" in difference_markdown(difference)
+    text = difference_markdown(difference)
+    assert "| S1 | appeared | 3.12 | 0.28 | ≥ +26.0 | < 1e-06 |" in text
+    assert "| S4 | unchanged | 3.00 | 4.20 | +0.7 ± 0.5 | 0.8 |" in text
     nothing = replace(difference, ratio=replace(difference.ratio, changes=()))
-    assert "No place is louder" in difference_markdown(nothing)
+    assert "Nothing differs." in difference_markdown(nothing)

@@ -172,6 +172,7 @@ def test_a_diff_folder_holds_every_file_and_its_ratio(tmp_path):
         timings_s={"compare": 0.1},
     )
     assert {path.name for path in tmp_path.iterdir()} == {
+        "changes.csv",
         "map.pgm",
         "map.yaml",
         "power_ratio.npz",
@@ -185,7 +186,17 @@ def test_a_diff_folder_holds_every_file_and_its_ratio(tmp_path):
     np.testing.assert_array_equal(stored["background_measured"], ratio.background_measured)
     assert stored["origin_m"].tolist() == [-0.5, -0.5]
     lines = (tmp_path / "sources.csv").read_text().splitlines()
-    assert lines[:2] == ["id,x_m,y_m,ratio_db,visits", "S1,3.125,0.275,26.02,22"]
+    assert lines[0].startswith("id,x_m,y_m,ratio_db,visits,kind,")
+    assert lines[1:] == [
+        "S1,3.125,0.275,26.02,22,appeared,,1e-09,S1,",
+        "S2,5.725,3.375,19.9,17,louder,0.4,0.002,S2,S1",
+    ]
+    every = (tmp_path / "changes.csv").read_text().splitlines()
+    assert every[:3] == lines
+    assert every[3:] == [
+        "S3,1.0,3.0,-14.0,2,gone,,0.001,,S2",
+        "S4,3.0,4.2,0.7,9,unchanged,0.5,0.8,S3,S3",
+    ]
     assert report["timings_s"]["compare"] == 0.1
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from handmade import made_ratio, made_run, unlucky_run, walled_room
+from handmade import fitted_run, made_ratio, made_run, unlucky_run, walled_room
 
 from soundmap.config import DiffConfig
 from soundmap.errors import LogError
@@ -73,9 +73,45 @@ def test_a_difference_reads_back_as_it_was(tmp_path):
     np.testing.assert_array_equal(read.ratio.ratio_db, ratio.ratio_db)
     np.testing.assert_array_equal(read.ratio.background_measured, ratio.background_measured)
     assert read.ratio.frame == ratio.frame
-    assert [change.ratio_db for change in read.ratio.changes] == [26.02, 19.9]
+    rounded = [replace(change, ratio_db=round(change.ratio_db, 3)) for change in ratio.changes]
+    assert list(read.ratio.changes) == rounded
+    assert len(read.ratio.louder) == 2
     assert same(read.room, walled_room())
     assert read.title == "run1 against run3"
+
+
+def test_a_difference_of_an_earlier_soundmap_still_reads(tmp_path):
+    write_diff(
+        replace(made_ratio(), changes=made_ratio().changes[:2]),
+        tmp_path,
+        room=None,
+        run=Path("run1"),
+        background=Path("run3"),
+        config=DiffConfig(),
+        timings_s={},
+        figures=PictureFormat.NONE,
+    )
+    report = json.loads((tmp_path / "report.json").read_text())
+    del report["changes"]
+    for row in report["sources"]:
+        for name in set(row) - {"id", "x_m", "y_m", "ratio_db", "visits"}:
+            del row[name]
+    (tmp_path / "report.json").write_text(json.dumps(report))
+    changes = read_difference(tmp_path).ratio.changes
+    assert [change.ratio_db for change in changes] == [26.02, 19.9]
+    assert {change.false_alarm_probability for change in changes} == {None}
+
+
+def test_what_a_fit_found_reads_back_as_it_was(tmp_path):
+    run = fitted_run()
+    write_run(run, tmp_path, figures=PictureFormat.NONE)
+    read = read_run(tmp_path).sources
+    for found, made in zip(read, run.sources, strict=True):
+        assert found.fit.flags == made.fit.flags
+        np.testing.assert_allclose(found.fit.covariance_m2, made.fit.covariance_m2)
+        assert found.fit.power_1m == pytest.approx(made.fit.power_1m, rel=1e-3)
+        assert found.fit.false_alarm_probability == made.fit.false_alarm_probability
+    assert [image.source for image in read.reflections] == [0, None]
 
 
 def test_what_is_no_run_folder_is_said_to_be_none(tmp_path):

@@ -2,7 +2,7 @@ import io
 from dataclasses import replace
 
 import pytest
-from handmade import made_ratio, made_run, unlucky_run
+from handmade import fitted_run, made_ratio, made_run, unlucky_run
 from rich.console import Console
 
 from soundmap.config import DiffConfig
@@ -34,6 +34,15 @@ def test_the_summary_of_a_run_names_everything_a_person_asks_for():
     assert all(word in " ".join(text.split()) for word in ("1294", "/odom", "lost", "note"))
 
 
+def test_the_summary_tells_errors_and_remarks_where_a_fit_knows_them():
+    text = run_text(fitted_run())
+    rows = [line.split() for line in text.splitlines() if line.strip().startswith("S")]
+    assert ["S1", "3.125", "0.275", "5", "x", "5", "-64.0", "22"] in rows
+    assert rows[1][:8] == ["S2", "5.725", "3.375", "29", "x", "12", "-70.0", "17"]
+    assert "not seen by laser" in " ".join(text.split())
+    assert max(len(line) for line in text.splitlines()) <= 80
+
+
 def test_the_summary_fits_eighty_columns():
     assert max(len(line) for line in run_text(made_run()).splitlines()) <= 80
 
@@ -60,7 +69,7 @@ def test_brackets_in_what_a_log_says_are_not_taken_for_markup():
 
 
 @pytest.mark.parametrize("changes", [True, False])
-def test_the_summary_of_a_difference_lists_what_became_louder(changes):
+def test_the_summary_of_a_difference_lists_what_changed(changes):
     ratio = made_ratio() if changes else replace(made_ratio(), changes=())
     report = diff_report(
         ratio,
@@ -71,8 +80,9 @@ def test_the_summary_of_a_difference_lists_what_became_louder(changes):
     )
     text = printed(diff_view({**report, "folder": "run1-run3"}))
     assert "run1 against run3" in text
-    assert ("26.0" in text) == changes
-    assert ("no place is louder" in text) == (not changes)
+    assert ("≥ +26.0" in text) == changes
+    assert ("nothing differs" in text) == (not changes)
+    assert all(len(line) <= 80 for line in text.splitlines())
 
 
 def log_summary() -> dict:

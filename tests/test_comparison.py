@@ -1,0 +1,125 @@
+"""Two run folders compared: nothing changes by itself, and what changes is told."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from soundmap.change import ChangeKind
+from soundmap.comparison import compared
+from soundmap.config import Config
+from soundmap.outputs.picture_format import PictureFormat
+from soundmap.outputs.run_folder import write_run
+from soundmap.sound import Reflection, Source, SourceFit, SourceList
+from tests.handmade import made_run
+from tests.heard import drive, heard_scans
+
+CONFIG = Config()
+PLACES = [(2.5, 0.3), (5.7, 2.4), (2.0, 4.1)]
+LOUDNESS = [4e-7, 1e-7, 2e-7]
+
+
+def folder(
+    path, sounding, *, found=None, seed, way=((1.0, 1.0), (5.0, 1.0), (5.0, 3.5), (1.0, 3.5))
+):
+    """A run folder whose scans hold some sources (x, y, loudness), and which names some of them."""
+    track = drive(way)
+    rng = np.random.default_rng(seed)
+    fit = SourceFit(1e-7, 0.02**2 * np.eye(2), 1e-9, 1.0, ())
+    named = sounding if found is None else found
+    sources = tuple(
+        Source(
+            *(np.array(place) + rng.normal(0.0, 0.01, 2)), power, 80, replace(fit, power_1m=power)
+        )
+        for *place, power in named
+    )
+    base = made_run(Path("run.mcap"))
+    scans = heard_scans(track, sounding, seed=seed)
+    images = (Reflection(2.5, -0.4, 1e-8, 0),) if named else ()
+    run = replace(
+        base, trajectory=track, scans=scans, sources=SourceList(sources, scans.reference, images)
+    )
+    path.mkdir()
+    write_run(run, path, figures=PictureFormat.NONE)
+    return path
+
+
+def everything(factors=(1.0, 1.0, 1.0)):
+    rows = zip(PLACES, LOUDNESS, factors, strict=True)
+    return [(*place, power * factor) for place, power, factor in rows if factor > 0.0]
+
+
+def differences(run, background):
+    return compared(run, background, CONFIG.diff, CONFIG.detect).ratio.changes
+
+
+def kinds(changes):
+    """Kind of each source by its place."""
+    nearest = {
+        min(range(3), key=lambda n: np.hypot(PLACES[n][0] - c.x_m, PLACES[n][1] - c.y_m)): c
+        for c in changes
+    }
+    return [str(nearest[n].kind) for n in sorted(nearest)]
+
+
+def test_an_unchanged_site_shows_no_change_between_any_two_runs(tmp_path):
+    back = ((1.2, 3.4), (4.8, 3.4), (4.9, 1.2), (1.0, 1.1))
+    runs = [folder(tmp_path / f"run{n}", everything(), seed=n) for n in range(3)]
+    runs.append(folder(tmp_path / "back", everything(), seed=9, way=back))
+    for one in runs:
+        for other in runs:
+            assert kinds(differences(one, other)) == ["unchanged"] * 3
+
+
+def test_changes_of_each_kind_between_two_loud_runs(tmp_path):
+    before = folder(tmp_path / "before", everything((1.0, 1.0, 0.0)), seed=1)
+    after = folder(tmp_path / "after", everything((3.0, 0.0, 1.0)), seed=2)
+    changes = differences(after, before)
+    assert kinds(changes) == ["louder", "gone", "appeared"]
+    louder = next(c for c in changes if c.kind == ChangeKind.LOUDER)
+    assert louder.ratio_db == pytest.approx(10 * np.log10(3.0), abs=1.2)
+    assert 0.1 < louder.sigma_db < 1.0
+    assert kinds(differences(before, after)) == ["quieter", "appeared", "gone"]
+
+
+def test_louder_ones_come_first_the_greatest_first(tmp_path):
+    before = folder(tmp_path / "before", everything((1.0, 1.0, 0.0)), seed=1)
+    after = folder(tmp_path / "after", everything((3.0, 0.0, 1.0)), seed=2)
+    order = [change.kind for change in differences(after, before)]
+    assert order == ["appeared", "louder", "gone"]
+
+
+def test_a_source_that_one_run_missed_has_not_changed(tmp_path):
+    first = folder(tmp_path / "first", everything(), seed=1)
+    second = folder(tmp_path / "second", everything(), found=everything((1, 0, 1)), seed=2)
+    assert kinds(differences(first, second)) == ["unchanged"] * 3
+    assert kinds(differences(second, first)) == ["unchanged"] * 3
+
+
+def test_against_a_silent_background_all_appeared(tmp_path):
+    run = folder(tmp_path / "run", everything(), seed=1)
+    silent = folder(tmp_path / "silent", [], seed=2)
+    assert kinds(differences(run, silent)) == ["appeared"] * 3
+    assert kinds(differences(silent, run)) == ["gone"] * 3
+    assert differences(silent, silent) == ()
+
+
+def test_runs_in_different_maps_are_compared_with_a_note(tmp_path):
+    run = folder(tmp_path / "run", everything(), seed=1)
+    other = folder(tmp_path / "other", everything(), seed=2)
+    assert compared(run, other, CONFIG.diff, CONFIG.detect).notes == ()
+    yaml = other / "map.yaml"
+    yaml.write_text(yaml.read_text().replace("-0.5", "-0.4"))
+    (note,) = compared(run, other, CONFIG.diff, CONFIG.detect).notes
+    assert "different maps" in note.what
+    assert not note.data_lost
+
+
+def test_folders_that_tell_of_no_sources_are_compared_cell_by_cell(tmp_path):
+    """As the paper does, and as folders of an earlier soundmap have to be."""
+    run = folder(tmp_path / "run", everything(), seed=1)
+    other = folder(tmp_path / "other", everything(), seed=2)
+    (other / "trajectory.npz").unlink()
+    changes = differences(run, other)
+    assert all(change.run_source is None for change in changes)
