@@ -51,7 +51,7 @@ def _sound() -> np.ndarray:
     count = (END_NS - START_NS) * RATE // SECOND // 320 * 320
     over = 16
     spectrum = np.fft.rfft(rng.standard_normal(count + RATE))
-    spectrum[np.fft.rfftfreq(count + RATE, 1 / RATE) < 800.0] = 0.0
+    spectrum[np.fft.rfftfreq(count + RATE, 1 / RATE) < 200.0] = 0.0
     fine = np.fft.irfft(spectrum, over * (count + RATE)) * over
     emitted_s = np.arange(len(fine)) / (over * RATE) - 0.5
     time_s = np.arange(count) / RATE

@@ -26,6 +26,9 @@ from soundmap.logs.topics import audio_topic
 from soundmap.losses import LossLedger
 from soundmap.sensors import MicArray
 
+WRONG_RATE_PPM = 2000.0
+"""No quartz is that far off its rate: the recorder tells a wrong one."""
+
 
 @dataclass(frozen=True)
 class AudioStream:
@@ -49,6 +52,25 @@ class AudioStream:
     message: NDArray[np.intp]
     clock: SampleClock
     stamp_is_start: bool
+    counts_gaps = True
+
+    @property
+    def name(self) -> str:
+        """The topic."""
+        return self.topic.name
+
+    @property
+    def logged_ns(self) -> Times:
+        """When the blocks used were logged, rising."""
+        record = self.topic.record
+        logged = record.log_time_ns if isinstance(record, AudioRecord) else ()
+        return np.sort(np.array(logged, dtype=np.int64)[self.message[self.clock.kept]])
+
+    @property
+    def rate_hz(self) -> float:
+        """Sample rate [Hz]: as the recorder tells it, or by the stamps if that must be wrong."""
+        told = abs(self.clock.drift_ppm) <= WRONG_RATE_PPM
+        return self.encoding.rate_hz if told else self.clock.rate_hz
 
 
 def audio_stream(
@@ -76,7 +98,13 @@ def audio_stream(
             f"{log_name}: no usable audio on {topic.name}: none of {topic.messages} messages is "
             "sound."
         )
-    times, own_ahead_ns = stream_times(record.stamp_ns, record.log_time_ns, topic.name, losses)
+    times, own_ahead_ns = stream_times(
+        record.stamp_ns,
+        record.log_time_ns,
+        topic.name,
+        losses,
+        reference_ahead_ns=ahead_ns,
+    )
     if ahead_ns is not None:
         times = on_common_clock(times, own_ahead_ns, ahead_ns, topic.name, losses)
     stamped = times[kept] != DAMAGED
@@ -92,28 +120,33 @@ def audio_stream(
         stamp_is_start=is_start,
         first_frame=None if np.any(counter < 0) else counter,
     )
-    _count_clock_losses(clock, topic.name, losses)
+    logged_ns = np.array(record.log_time_ns, dtype=np.int64)
+    _count_clock_losses(clock, topic.name, logged_ns[kept], losses)
     return AudioStream(topic, encoding, sample, kept, clock, is_start)
 
 
-def _count_clock_losses(clock: SampleClock, topic: str, losses: LossLedger) -> None:
+def _count_clock_losses(
+    clock: SampleClock, topic: str, logged_ns: Times, losses: LossLedger
+) -> None:
     losses.add(
         "audio block repeats or overlaps the one before",
         topic,
         count=int(np.count_nonzero(~clock.kept)),
         effect="left out",
+        time_ns=logged_ns[~clock.kept],
     )
     losses.add(
         "gap in the audio",
         topic,
         count=clock.gaps,
         effect=f"{clock.lost_s:.2f} s missing; nothing is joined over it",
+        time_ns=logged_ns[clock.kept & ~clock.continues][1:],
     )
-    if abs(clock.drift_ppm) > 2000.0:
-        losses.remark(
+    if abs(clock.drift_ppm) > WRONG_RATE_PPM:
+        losses.add(
             f"the sample rate by the stamps is {clock.rate_hz:.0f} Hz, not the recorder's",
             topic,
-            effect="times follow the stamps",
+            effect="times and frequencies follow the stamps",
         )
 
 
@@ -165,6 +198,7 @@ def _whole_blocks(
 ) -> tuple[NDArray[np.intp], Times]:
     """Messages of the chosen encoding whose length is as declared, and their lengths."""
     index = np.array(record.encoding, dtype=np.int64)
+    logged_ns = np.array(record.log_time_ns, dtype=np.int64)
     chosen = [i for i, e in enumerate(record.encodings) if e is None or e == encoding]
     usable = np.isin(index, chosen)
     losses.add(
@@ -172,6 +206,7 @@ def _whole_blocks(
         topic,
         count=int(np.count_nonzero(~usable & (index >= 0))),
         effect="left out",
+        time_ns=logged_ns[~usable & (index >= 0)],
     )
     size = np.array(record.size, dtype=np.int64)
     frames, rest = np.divmod(size, encoding.channels * sample.width)
@@ -182,6 +217,7 @@ def _whole_blocks(
         topic,
         count=int(np.count_nonzero(usable & ~whole)),
         effect="left out",
+        time_ns=logged_ns[usable & ~whole],
     )
     kept = np.flatnonzero(usable & whole)
     return kept, frames[kept]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from io import BytesIO
@@ -41,17 +41,25 @@ class FileSummary:
         Where chunks begin, rising.
     messages : int
         How many there are in the file; 0 if that is not told.
+    damaged : bool
+        Whether there should be a summary but cannot be read.
     """
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     chunk_offsets: list[int] = field(default_factory=list)
     messages: int = 0
+    damaged: bool = False
 
     def next_chunk(self, position: int) -> int | None:
         """Offset of the first chunk after a position, None if there is none."""
         place = bisect_right(self.chunk_offsets, position)
         return self.chunk_offsets[place] if place < len(self.chunk_offsets) else None
+
+    def has_chunk(self, position: int) -> bool:
+        """Whether a chunk begins at a position, by the index."""
+        place = bisect_left(self.chunk_offsets, position)
+        return place < len(self.chunk_offsets) and self.chunk_offsets[place] == position
 
 
 def file_summary(stream: IO[bytes], size: int) -> FileSummary:
@@ -62,7 +70,7 @@ def file_summary(stream: IO[bytes], size: int) -> FileSummary:
     tail = stream.read(_TAIL_BYTES)
     opcode, length = RECORD_HEAD.unpack_from(tail)
     if opcode != Opcode.FOOTER or length != 20 or not tail.endswith(MAGIC):
-        return FileSummary()
+        return FileSummary(damaged=True)
     start = Footer.read(ReadDataStream(BytesIO(tail[RECORD_HEAD.size :]))).summary_start
     if start == 0:
         return FileSummary()
@@ -73,7 +81,7 @@ def file_summary(stream: IO[bytes], size: int) -> FileSummary:
     stream.seek(first)
     end = stream.read(size - first).rfind(_DATA_END)
     found = _at(stream, first + end + len(_DATA_END) + 4, size, tail) if end >= 0 else None
-    return replace(found, chunk_offsets=[]) if found else FileSummary()
+    return replace(found, chunk_offsets=[]) if found else FileSummary(damaged=True)
 
 
 def _at(stream: IO[bytes], start: int, size: int, tail: bytes) -> FileSummary | None:

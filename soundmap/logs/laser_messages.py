@@ -30,6 +30,8 @@ class LaserSweep(NamedTuple):
         Limits of the ranges that the scanner can measure; NaN if the message does not tell.
     ranges : array_like
         As recorded.
+    beams_told : int
+        How many ranges there should be by the angles; may be one off.
     pose : tuple or None
         x, y, z, qx, qy, qz, qw of the scanner in its frame, if it is not the frame itself.
     """
@@ -42,6 +44,7 @@ class LaserSweep(NamedTuple):
     range_min_m: float
     range_max_m: float
     ranges: Any
+    beams_told: int
     pose: Pose7 | None
 
 
@@ -50,15 +53,26 @@ def valid_ranges(sweep: LaserSweep) -> FloatArray:
 
     No return is what a scanner reports as NaN, infinite, nought, or outside its own limits.
     """
+    low, high = _limits(sweep)
     with np.errstate(invalid="ignore"):  # what a signalling NaN raises when it is widened
         ranges = np.array(sweep.ranges, dtype=np.float64)
-    low = max(sweep.range_min_m, 0.0) if np.isfinite(sweep.range_min_m) else 0.0
-    high = sweep.range_max_m if np.isfinite(sweep.range_max_m) else np.inf
-    if not high > low:
-        low, high = 0.0, np.inf
-    with np.errstate(invalid="ignore"):
         ranges[~((ranges > 0.0) & (ranges >= low) & (ranges < high))] = np.nan
     return ranges
+
+
+def has_return(sweep: LaserSweep) -> bool:
+    """Whether any of the ranges is valid."""
+    low, high = _limits(sweep)
+    with np.errstate(invalid="ignore"):
+        ranges = np.asarray(sweep.ranges)
+        return bool(np.any((ranges > 0.0) & (ranges >= low) & (ranges < high)))
+
+
+def _limits(sweep: LaserSweep) -> tuple[float, float]:
+    """Least and greatest range that means a return [m]."""
+    low = max(sweep.range_min_m, 0.0) if np.isfinite(sweep.range_min_m) else 0.0
+    high = sweep.range_max_m if np.isfinite(sweep.range_max_m) else np.inf
+    return (low, high) if high > low else (0.0, np.inf)
 
 
 def _step(first: float, last: float, step: float, count: int) -> float:
@@ -68,12 +82,18 @@ def _step(first: float, last: float, step: float, count: int) -> float:
     return (last - first) / (count - 1) if count > 1 else 0.0
 
 
+def _are_angles(first: float, step: float, count: int) -> bool:
+    """Whether rays have a bearing each: finite, and not all the same."""
+    return bool(np.isfinite(first) and np.isfinite(step)) and (step != 0.0 or count < 2)
+
+
 def _laser_scan(message: Any) -> LaserSweep:
     first, last = float(message.angle_min), float(message.angle_max)
     step = _step(first, last, float(message.angle_increment), len(message.ranges))
-    if not (np.isfinite(first) and np.isfinite(step)):
+    if not _are_angles(first, step, len(message.ranges)):
         raise MessageError("laser scan without sound angles")
     interval = float(message.time_increment)
+    told = (last - first) / step + 1.0 if step else np.nan
     return LaserSweep(
         ros_stamp_ns(message.header.stamp),
         frame_name(message.header.frame_id),
@@ -83,6 +103,7 @@ def _laser_scan(message: Any) -> LaserSweep:
         float(message.range_min),
         float(message.range_max),
         message.ranges,
+        round(told) if 0.0 < told < 2**30 else len(message.ranges),
         None,
     )
 
@@ -90,7 +111,7 @@ def _laser_scan(message: Any) -> LaserSweep:
 def _angle_range_scan(message: Any) -> LaserSweep:
     first, last, count = float(message.start_angle), float(message.end_angle), len(message.ranges)
     step = _step(first, last, 0.0, count)
-    if not (np.isfinite(first) and np.isfinite(step)):
+    if not _are_angles(first, step, count):
         raise MessageError("laser scan without sound angles")
     pose = None
     if hasattr(message, "pose"):
@@ -109,6 +130,7 @@ def _angle_range_scan(message: Any) -> LaserSweep:
         np.nan,
         np.nan,
         message.ranges,
+        count,
         pose,
     )
 

@@ -58,7 +58,14 @@ KINDS = {
 _FIELDS: tuple[tuple[Form, tuple[str, ...]], ...] = (
     (
         Form.AUDIO_FRAME,
-        ("header.stamp", "format", "channel_count", "sampling_frequency", "frame_sample_count"),
+        (
+            "header.stamp",
+            "format",
+            "channel_count",
+            "sampling_frequency",
+            "frame_sample_count",
+            "data",
+        ),
     ),
     (
         Form.COUNTED_AUDIO,

@@ -19,6 +19,15 @@ from soundmap.losses import LossLedger
 MIN_QUATERNION_NORM = 1e-3
 """A quaternion shorter than this was never set."""
 
+JUMP_M, JUMP_RAD = 0.05, 0.1
+"""A step must exceed this, beyond what the robot can drive in its time, to be a jump ..."""
+
+MAX_SPEED, MAX_TURN_RATE = 3.0, 6.0
+"""... at this speed [m/s] and turn rate [rad/s], or thrice those that it usually has ..."""
+
+FEW_JUMPS = 0.05
+"""... and steps that are too long must be rare."""
+
 
 class OdometryRecord:
     """Odometry messages of one topic as they come, compactly.
@@ -70,7 +79,12 @@ class OdometryRecord:
 
 
 def odometry_trajectory(
-    time_ns: NDArray[np.int64], numbers: FloatArray, topic: str, losses: LossLedger
+    time_ns: NDArray[np.int64],
+    numbers: FloatArray,
+    topic: str,
+    losses: LossLedger,
+    *,
+    ahead_ns: int = 0,
 ) -> tuple[Trajectory, str]:
     """The base in the odometry frame, and whether that is by "pose" or "twist".
 
@@ -84,6 +98,8 @@ def odometry_trajectory(
         For the losses.
     losses : LossLedger
         Where messages left out and poses replaced are counted.
+    ahead_ns : int
+        How far the times are ahead of the log's own.
     """
     rising = increasing(time_ns)
     losses.add(
@@ -91,6 +107,7 @@ def odometry_trajectory(
         topic,
         count=int(np.count_nonzero(~rising)),
         effect="message left out",
+        time_ns=time_ns[~rising] - ahead_ns,
     )
     time_ns, numbers = time_ns[rising], numbers[rising]
     pose, sound = _planar_poses(numbers)
@@ -105,18 +122,28 @@ def odometry_trajectory(
         topic,
         count=int(np.count_nonzero(by_twist)),
         effect="motion taken from the twist",
+        time_ns=time_ns[by_twist] - ahead_ns,
     )
     losses.add(
         "odometry pose is not finite, nor is the twist usable",
         topic,
         count=int(np.count_nonzero(bad & ~moving)),
         effect="message left out",
+        time_ns=time_ns[bad & ~moving] - ahead_ns,
     )
     keep = sound | moving
     time_ns, pose, sound, twist = time_ns[keep], pose[keep], sound[keep], twist[keep]
     twist = np.where(moving[keep][:, None], twist, np.nan)
     if not np.all(sound):
         pose = _bridged(time_ns, pose, sound, twist)
+    pose, jumps = _without_jumps(time_ns, pose, twist)
+    losses.add(
+        "odometry jumps",
+        topic,
+        count=len(jumps),
+        effect="taken for a reset: motion as before it",
+        time_ns=time_ns[jumps] - ahead_ns,
+    )
     source = "twist" if np.count_nonzero(by_twist) > np.count_nonzero(sound) else "pose"
     return Trajectory(time_ns, pose, np.ones(len(time_ns), dtype=bool)), source
 
@@ -182,6 +209,41 @@ def _bridged(
         else:
             shift = composed(reached[-1], inverted(pose[b]))
     return result
+
+
+def _without_jumps(
+    time_ns: NDArray[np.int64], pose: FloatArray, twist: FloatArray
+) -> tuple[FloatArray, NDArray[np.intp]]:
+    """Poses with steps that no robot makes replaced, and the indices of the poses after them.
+
+    Odometry that was reset goes on from elsewhere: what follows is moved so that the robot, over
+    the jump, drives by its twist, else as in the step before.
+    """
+    if len(pose) < 3:
+        return pose, np.zeros(0, dtype=np.intp)
+    step = relative(pose[:-1], pose[1:])
+    dt = np.diff(time_ns) * 1e-9
+    # A stamp that came late makes the next step look fast.
+    lasted = np.maximum(dt, np.quantile(dt, 0.95))
+    distance, turn = np.hypot(step[:, 0], step[:, 1]), np.abs(step[:, 2])
+    usual = [float(np.quantile(size / lasted, 0.95)) for size in (distance, turn)]
+    jumps = np.flatnonzero(
+        (distance > JUMP_M + np.maximum(MAX_SPEED, 3.0 * usual[0]) * lasted)
+        | (turn > JUMP_RAD + np.maximum(MAX_TURN_RATE, 3.0 * usual[1]) * lasted)
+    )
+    if len(jumps) > FEW_JUMPS * len(step):
+        return pose, np.zeros(0, dtype=np.intp)  # that is how this odometry is
+    driven = _driven(twist, dt)
+    told = np.all(np.isfinite(twist), axis=1)
+    known: NDArray[np.bool_] = np.asarray(told[:-1] | told[1:])
+    result = pose.copy()
+    for i in jumps.tolist():
+        before = max(i - 1, 0)
+        coasting = step[before] * (dt[i] / lasted[before]) if before not in jumps else np.zeros(3)
+        wanted = composed(result[i], driven[i] if known[i] else coasting)
+        shift = composed(wanted, inverted(result[i + 1]))
+        result[i + 1 :] = composed(shift, result[i + 1 :])
+    return result, jumps + 1
 
 
 def _driven(twist: FloatArray, dt: FloatArray) -> FloatArray:

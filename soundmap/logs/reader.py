@@ -30,7 +30,7 @@ from soundmap.logs.file_summary import (
     FileSummary,
     file_summary,
 )
-from soundmap.logs.resync import next_record
+from soundmap.logs.resync import is_near, next_record
 from soundmap.losses import LossLedger
 
 BATCH_BYTES = 2**20
@@ -214,9 +214,15 @@ class _FileWalk:
             onward = self.summary.next_chunk(position)
             is_end = opcode in (Opcode.DATA_END, Opcode.FOOTER)
             if onward is None and is_end:
+                if self.summary.damaged:
+                    self.log.count(
+                        "damaged end of the file", self.file.name, "its own summary is not used"
+                    )
                 return
-            # A record that reaches over the next chunk of the index lies, and so does an early end.
-            if opcode != 0 and not is_end and end <= (onward or self.size):
+            # A record that reaches over the next chunk of the index lies, and so does an early end,
+            # and what stands in place of a chunk.
+            lies = opcode == 0 or is_end or end > (onward or self.size)
+            if not lies and (opcode == Opcode.CHUNK or not self.summary.has_chunk(position)):
                 yield opcode, position + RECORD_HEAD.size, length
                 position = end
                 continue
@@ -243,6 +249,12 @@ class _FileWalk:
             self.messages += 1
             channel = self._selected(channel_id)
             if channel is None or not self._is_time(log_time):
+                return None
+            # Where there are chunks, a message outside may be something else in disguise.
+            if self.chunked and not (
+                is_near(log_time, self.last_ns) and is_near(publish_time, self.last_ns)
+            ):
+                self.log.count("message between chunks makes no sense", self.file.name, "left out")
                 return None
             return Message(channel, log_time, publish_time, data[_MESSAGE.size :])
         try:

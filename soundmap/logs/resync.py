@@ -70,12 +70,15 @@ def _is_record(data: bytes, offset: int, room: int, near_ns: int) -> bool:
     if length > min(room - offset - 9, MAX_CHUNK_BYTES):
         return False
     if kind == _MESSAGE:
-        return length >= 22 and _near(time_ns, near_ns) and _near(published_ns, near_ns)
+        return length >= 22 and is_near(time_ns, near_ns) and is_near(published_ns, near_ns)
     if length < 40 or offset + _CHUNK_HEAD.size > len(data):
         return False
     _, _, start_ns, end_ns, _, _, name = _CHUNK_HEAD.unpack_from(data, offset)
-    return name <= 4 and start_ns <= end_ns and _near(start_ns, near_ns) and _near(end_ns, near_ns)
+    return (
+        name <= 4 and start_ns <= end_ns and is_near(start_ns, near_ns) and is_near(end_ns, near_ns)
+    )
 
 
-def _near(time_ns: int, near_ns: int) -> bool:
+def is_near(time_ns: int, near_ns: int) -> bool:
+    """Whether two times may belong to one log."""
     return bool(abs(time_ns - near_ns) < NEAR_NS)

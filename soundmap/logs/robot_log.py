@@ -13,11 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from soundmap.config import Config
 from soundmap.geometry import FloatArray, Mount, Trajectory
-from soundmap.logs.audio_messages import PACKET_READERS, block_samples
+from soundmap.logs.array_health import array_health, without_faulty
+from soundmap.logs.audio_blocks import audio_blocks
 from soundmap.logs.audio_stream import AudioStream, audio_stream, microphone_array
+from soundmap.logs.coverage import count_silences
 from soundmap.logs.laser_messages import SWEEP_READERS, LaserSweep, valid_ranges
 from soundmap.logs.log_files import log_files
 from soundmap.logs.reader import McapLog
@@ -74,6 +77,7 @@ class RobotLog:
     _survey: Survey
     _laser_streams: tuple[LaserStream, ...]
     _audio_stream: AudioStream | None
+    _channels: NDArray[np.intp]
 
     def lasers(self) -> Iterator[LaserScan]:
         """Scans of all scanners by the time of their first ray; a fresh pass every call."""
@@ -109,25 +113,7 @@ class RobotLog:
         stream = self._audio_stream
         if stream is None:
             raise ValueError("the log was opened without audio")
-        clock, name = stream.clock, stream.topic.name
-        read = PACKET_READERS[stream.topic.form]
-        decoders = self._survey.decoders
-        used, block = stream.message.tolist(), 0
-        for number, message in enumerate(self._log.messages(lambda c: c.topic == name)):
-            if block == len(used):
-                return
-            if number != used[block]:
-                continue
-            if clock.kept[block]:
-                packet = read(decoders.decoder(message.channel)(message.data))
-                yield AudioBlock(
-                    time_ns=int(clock.start_ns[block]),
-                    rate_hz=stream.encoding.rate_hz,
-                    samples=block_samples(packet.data, stream.encoding, stream.sample),
-                    full_scale=stream.sample.full_scale,
-                    continues=bool(clock.continues[block]),
-                )
-            block += 1
+        return audio_blocks(self._log, self._survey, stream, self._channels, self.losses)
 
 
 class _ScanReader:
@@ -210,7 +196,12 @@ def open_log(path: Path, config: Config, *, need_audio: bool = True) -> RobotLog
     mounts = base_mounts(survey, config, odometry, name, losses)
     lasers = laser_streams(survey, config, mounts, ahead_ns, name, losses)
     audio = audio_stream(survey, config, ahead_ns, name, losses) if need_audio else None
-    array = microphone_array(config, audio, mounts, name) if audio else None
+    array, channels = None, np.zeros(0, dtype=np.intp)
+    if audio:
+        whole = microphone_array(config, audio, mounts, name)
+        health = array_health(audio, whole.positions_m, losses)
+        array, channels = without_faulty(whole, health, name)
+    count_silences(filter(None, [odometry, *lasers, audio]), losses)
     return RobotLog(
         path=path,
         fingerprint=log.fingerprint(),
@@ -219,10 +210,11 @@ def open_log(path: Path, config: Config, *, need_audio: bool = True) -> RobotLog
         odometry=odometry.trajectory,
         base_frame=mounts.base,
         array=array,
-        sample_rate_hz=audio.encoding.rate_hz if audio else 0.0,
+        sample_rate_hz=audio.rate_hz if audio else 0.0,
         scanners=tuple(stream.topic.name for stream in lasers),
         _log=log,
         _survey=survey,
         _laser_streams=lasers,
         _audio_stream=audio,
+        _channels=channels,
     )

@@ -169,8 +169,11 @@ def _counts(
 
 
 def _measured_rate(seconds: FloatArray, marks: FloatArray, nominal: float) -> float:
-    """Rate from the median slope over some twenty blocks; nominal if there are too few."""
-    span = min(20, len(marks) // 2)
+    """Rate from the median slope over some twenty blocks; nominal if there are too few.
+
+    The blocks are few against all, so that one gap touches few of the slopes.
+    """
+    span = min(20, len(marks) // 8)
     if span < 4:
         return nominal
     with np.errstate(divide="ignore", invalid="ignore"):

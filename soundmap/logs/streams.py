@@ -34,6 +34,17 @@ class OdometryStream:
     parent: str
     child: str
     ahead_ns: int
+    counts_gaps = False
+
+    @property
+    def name(self) -> str:
+        """The topic."""
+        return self.topic
+
+    @property
+    def logged_ns(self) -> Times:
+        """When the sound messages were logged, shape (K,), rising."""
+        return self.trajectory.time_ns - self.ahead_ns
 
 
 @dataclass(frozen=True)
@@ -58,6 +69,18 @@ class LaserStream:
     ray_interval_is_sound: bool
     range_max_m: float
     mounts: dict[str, Mount]
+    counts_gaps = False
+
+    @property
+    def name(self) -> str:
+        """The topic."""
+        return self.topic.name
+
+    @property
+    def logged_ns(self) -> Times:
+        """When the sound scans were logged, rising."""
+        logged = np.array(self.record.log_time_ns, dtype=np.int64)
+        return np.sort(logged[self.time_ns != DAMAGED])
 
 
 def odometry_stream(
@@ -79,7 +102,9 @@ def odometry_stream(
         name, record = topic.name, topic.record
     times, ahead_ns = stream_times(record.stamp_ns, record.log_time_ns, name, losses)
     whole = times != DAMAGED
-    trajectory, source = odometry_trajectory(times[whole], record.table()[whole], name, losses)
+    trajectory, source = odometry_trajectory(
+        times[whole], record.table()[whole], name, losses, ahead_ns=ahead_ns
+    )
     if len(trajectory) < 2:
         raise NothingUsableError(
             f"{log_name}: no usable odometry on {name}: {len(record)} messages, "
@@ -192,9 +217,17 @@ def _laser_stream(
     record = topic.record
     if not isinstance(record, LaserRecord):
         raise NothingUsableError(f"{log_name}: {topic.name} cannot be read ({topic.problem}).")
-    times, own_ahead_ns = stream_times(record.stamp_ns, record.log_time_ns, topic.name, losses)
+    times, own_ahead_ns = stream_times(
+        record.stamp_ns,
+        record.log_time_ns,
+        topic.name,
+        losses,
+        reference_ahead_ns=ahead_ns,
+    )
     if ahead_ns is not None:
         times = on_common_clock(times, own_ahead_ns, ahead_ns, topic.name, losses)
+    _leave_out_odd_scans(record, times, losses)
+    log_time_ns = np.array(record.log_time_ns, dtype=np.int64)
     sound = np.flatnonzero(times != DAMAGED)
     rising = increasing(times[sound])
     losses.add(
@@ -202,8 +235,17 @@ def _laser_stream(
         topic.name,
         count=int(np.count_nonzero(~rising)),
         effect="scan left out",
+        time_ns=log_time_ns[sound[~rising]],
     )
     times[sound[~rising]] = DAMAGED
+    if record.any_return:
+        losses.add(
+            "laser scan without a single return",
+            topic.name,
+            count=len(record.empty_ns),
+            effect="tells nothing",
+            time_ns=record.empty_ns,
+        )
     found = {frame: mounts.mount(frame, f"laser {topic.name}") for frame in record.frame_ids}
     for frame, mount in found.items():
         if mount.tilt_rad > TILT_WARNING_RAD:
@@ -220,6 +262,27 @@ def _laser_stream(
         record.longest_m,
         found,
     )
+
+
+def _leave_out_odd_scans(record: LaserRecord, times: Times, losses: LossLedger) -> None:
+    """Mark scans whose count of ranges fits their angles worse than is usual on the topic.
+
+    Many drivers tell the last angle wrong, always in the same way; so what is usual is right.
+    """
+    surplus = np.array(record.surplus, dtype=np.int64)
+    whole = times != DAMAGED
+    if not np.any(whole):
+        return
+    values, counts = np.unique(surplus[whole], return_counts=True)
+    odd = whole & (np.abs(surplus - values[np.argmax(counts)]) > 1)
+    losses.add(
+        "laser scan with more or fewer ranges than its angles tell",
+        record.topic,
+        count=int(np.count_nonzero(odd)),
+        effect="scan left out",
+        time_ns=np.array(record.log_time_ns, dtype=np.int64)[odd],
+    )
+    times[odd] = DAMAGED
 
 
 def _ray_interval_is_sound(record: LaserRecord, times: Times, losses: LossLedger) -> bool:

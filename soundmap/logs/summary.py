@@ -12,9 +12,13 @@ import numpy as np
 from soundmap.config import Config
 from soundmap.errors import SoundmapError
 from soundmap.geometry import Mount, wrapped_angle
+from soundmap.logs.array_health import array_health, without_faulty
+from soundmap.logs.audio_blocks import audio_blocks
 from soundmap.logs.audio_stream import AudioStream, audio_stream, microphone_array
+from soundmap.logs.coverage import count_silences
 from soundmap.logs.log_files import log_files
 from soundmap.logs.messages import Kind
+from soundmap.logs.microphones import MicrophoneHealth
 from soundmap.logs.mounts import FrameTree, Mounts
 from soundmap.logs.reader import McapLog
 from soundmap.logs.stamps import DAMAGED
@@ -47,7 +51,11 @@ class TopicSummary:
 
 @dataclass(frozen=True)
 class AudioSummary:
-    """The microphones' topic and its clock; ``stamp`` is "start" or "end" of a block."""
+    """The microphones' topic, its clock and its channels.
+
+    ``stamp`` is "start" or "end" of a block; ``level_db`` is that of each channel over the log [dB
+    re (full scale)^2], ``unsound_channels`` are left out of the array.
+    """
 
     topic: str
     channels: int
@@ -58,6 +66,8 @@ class AudioSummary:
     gaps: int
     lost_s: float
     stamp: str
+    level_db: tuple[float, ...]
+    unsound_channels: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -157,9 +167,19 @@ def log_summary(path: Path, config: Config) -> LogSummary:
     )
     lasers = attempted(lambda: laser_streams(survey, config, mounts, ahead_ns, name, losses)) or ()
     audio = attempted(lambda: audio_stream(survey, config, ahead_ns, name, losses))
+    health = None
     if audio is not None:
         stream = audio
-        attempted(lambda: microphone_array(config, stream, mounts, name))
+        array = attempted(lambda: microphone_array(config, stream, mounts, name))
+        health = array_health(stream, array.positions_m if array else None, losses)
+        if array is not None:
+            whole = array
+            attempted(lambda: without_faulty(whole, health, name))
+        if audio.sample.kind == "f":
+            every = np.arange(audio.encoding.channels)
+            for _ in audio_blocks(log, survey, audio, every, losses):
+                pass
+    count_silences(filter(None, [odometry, *lasers, audio]), losses)
     used = {stream.topic.name for stream in lasers}
     used |= {audio.topic.name} if audio else set()
     used |= {odometry.topic} if odometry else set()
@@ -170,7 +190,7 @@ def log_summary(path: Path, config: Config) -> LogSummary:
         end_ns=survey.end_ns,
         duration_s=(survey.end_ns - survey.start_ns) * 1e-9,
         topics=_topics(survey, used | _mount_topics(survey, odometry)),
-        audio=_audio(audio) if audio else None,
+        audio=_audio(audio, health) if audio else None,
         lasers=tuple(_laser(stream) for stream in lasers),
         odometry=_odometry(odometry) if odometry else None,
         base_frame=mounts.base or None,
@@ -222,7 +242,7 @@ def _topics(survey: Survey, used: set[str]) -> tuple[TopicSummary, ...]:
     )
 
 
-def _audio(stream: AudioStream) -> AudioSummary:
+def _audio(stream: AudioStream, health: MicrophoneHealth | None) -> AudioSummary:
     clock = stream.clock
     return AudioSummary(
         topic=stream.topic.name,
@@ -234,6 +254,8 @@ def _audio(stream: AudioStream) -> AudioSummary:
         gaps=clock.gaps,
         lost_s=clock.lost_s,
         stamp="start" if stream.stamp_is_start else "end",
+        level_db=tuple(health.level_db.tolist()) if health else (),
+        unsound_channels=tuple(np.flatnonzero(~health.sound).tolist()) if health else (),
     )
 
 

@@ -20,7 +20,7 @@ from soundmap.logs.audio_messages import (
     AudioFormatError,
     info_encoding,
 )
-from soundmap.logs.laser_messages import SWEEP_READERS, LaserSweep, valid_ranges
+from soundmap.logs.laser_messages import SWEEP_READERS, LaserSweep, has_return, valid_ranges
 from soundmap.logs.messages import KINDS, Form, Kind, form_of
 from soundmap.logs.odometry import OdometryRecord
 from soundmap.logs.reader import Channel, McapLog, Message
@@ -31,10 +31,16 @@ from soundmap.losses import LossLedger
 
 _ATTRIBUTE_FAULTS = (MessageError, AttributeError, TypeError, ValueError, OverflowError, IndexError)
 
+MAX_PROBES, PROBE_BYTES = 256, 2**16
+
 
 @dataclass
 class AudioRecord:
-    """What is kept of an audio topic: one entry a message, damaged ones included."""
+    """What is kept of an audio topic: one entry a message, damaged ones included.
+
+    ``probes`` holds the beginning of the data of some messages, by their number; up to the time of
+    logging ``judged_ns``, samples that are no numbers have been counted.
+    """
 
     form: Form
     stamp_ns: array[int] = field(default_factory=lambda: array("q"))
@@ -45,10 +51,14 @@ class AudioRecord:
     encoding: array[int] = field(default_factory=lambda: array("i"))
     encodings: list[AudioEncoding | None] = field(default_factory=list)
     frame_ids: Counter[str] = field(default_factory=Counter)
+    probes: dict[int, bytes] = field(default_factory=dict)
+    probe_step: int = 1
+    judged_ns: int = 0
 
     def add(self, decoded: Any, log_time_ns: int) -> None:
         """Take in a message; MessageError if it makes no sense."""
         packet = PACKET_READERS[self.form](decoded)
+        self._probe(packet.data)
         if packet.encoding not in self.encodings:
             self.encodings.append(packet.encoding)
         self.frame_ids[packet.frame_id] += 1
@@ -60,6 +70,15 @@ class AudioRecord:
             -1 if packet.first_frame is None else packet.first_frame,
             self.encodings.index(packet.encoding),
         )
+
+    def _probe(self, data: Any) -> None:
+        """Keep the beginning of a few messages, evenly over the log however long it gets."""
+        number = len(self.size)
+        if number % self.probe_step == 0:
+            self.probes[number] = bytes(memoryview(data)[:PROBE_BYTES])
+            if len(self.probes) > MAX_PROBES:
+                self.probe_step *= 2
+                self.probes = {n: d for n, d in self.probes.items() if n % self.probe_step == 0}
 
     def add_damaged(self, log_time_ns: int) -> None:
         """Take note of a message that cannot be used."""
@@ -78,13 +97,19 @@ class AudioRecord:
 
 @dataclass
 class LaserRecord:
-    """What is kept of a laser topic: one entry a message, damaged ones included."""
+    """What is kept of a laser topic: one entry a message, damaged ones included.
+
+    ``surplus`` is how many ranges there are beyond what the angles tell; ``empty_ns`` when scans
+    without any return were logged.
+    """
 
     form: Form
     topic: str
     losses: LossLedger
     stamp_ns: array[int] = field(default_factory=lambda: array("q"))
     log_time_ns: array[int] = field(default_factory=lambda: array("q"))
+    surplus: array[int] = field(default_factory=lambda: array("q"))
+    empty_ns: array[int] = field(default_factory=lambda: array("q"))
     frame_ids: Counter[str] = field(default_factory=Counter)
     first: LaserSweep | None = None
     beams: int = 0
@@ -95,25 +120,29 @@ class LaserRecord:
         """Take in a message; MessageError if it makes no sense."""
         sweep = SWEEP_READERS[self.form](decoded)
         if not len(sweep.ranges):
-            self.losses.add("laser scan without ranges", self.topic, effect="left out")
+            what = "laser scan without ranges"
+            self.losses.add(what, self.topic, effect="left out", time_ns=log_time_ns)
             self.add_damaged(log_time_ns)
             return
         if self.first is None:
             self.first, self.beams = sweep._replace(ranges=()), len(sweep.ranges)
-        unlimited = not np.isfinite(sweep.range_max_m) or sweep.range_max_m <= 0.0
-        if unlimited or not self.any_return:
-            ranges = valid_ranges(sweep)
-            if np.any(np.isfinite(ranges)):
-                self.any_return = True
-                self.longest_m = max(self.longest_m, float(np.nanmax(ranges)))
+        if not has_return(sweep):
+            self.empty_ns.append(log_time_ns)
+        else:
+            unlimited = not np.isfinite(sweep.range_max_m) or sweep.range_max_m <= 0.0
+            if unlimited or not self.any_return:
+                self.longest_m = max(self.longest_m, float(np.nanmax(valid_ranges(sweep))))
+            self.any_return = True
         self.frame_ids[sweep.frame_id] += 1
         self.stamp_ns.append(sweep.stamp_ns)
         self.log_time_ns.append(log_time_ns)
+        self.surplus.append(min(len(sweep.ranges) - sweep.beams_told, 2**30))
 
     def add_damaged(self, log_time_ns: int) -> None:
         """Take note of a message that cannot be used."""
         self.stamp_ns.append(DAMAGED)
         self.log_time_ns.append(log_time_ns)
+        self.surplus.append(0)
 
 
 @dataclass
@@ -214,6 +243,7 @@ class Survey:
         times = [(t.first_ns, t.last_ns) for t in self.topics.values() if t.messages]
         if times:
             self.start_ns, self.end_ns = min(t[0] for t in times), max(t[1] for t in times)
+        self.losses.start_ns = self.start_ns
 
     def _remark_on_built_in_types(self) -> None:
         bare = [t.name for t in self.topics.values() if t.built_in and t.kind is not Kind.OTHER]
@@ -258,7 +288,8 @@ class Survey:
             try:
                 take(decode(message.data), time)
             except _ATTRIBUTE_FAULTS:
-                self.losses.add(f"damaged {topic.kind} message", topic.name, effect="left out")
+                what = f"damaged {topic.kind} message"
+                self.losses.add(what, topic.name, effect="left out", time_ns=time)
                 self._skip(topic, time)
 
         return taker

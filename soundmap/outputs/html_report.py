@@ -13,6 +13,7 @@ from typing import Any
 
 import tomli_w
 
+from soundmap.losses import when
 from soundmap.outputs.html_findings import (
     changes_table,
     html_table,
@@ -198,13 +199,14 @@ def _losses(losses: Sequence[Mapping[str, Any]]) -> str:
         [
             "lost" if loss["data_lost"] else "note",
             str(loss["count"]),
+            when(loss.get("first_s"), loss.get("last_s")),
             loss["what"],
             loss["where"],
             loss["effect"],
         ]
         for loss in losses
     ]
-    return html_table(["", "Times", "What", "Where", "What was done"], rows)
+    return html_table(["", "Times", "When", "What", "Where", "What was done"], rows)
 
 
 def _provenance(report: Mapping[str, Any]) -> str:

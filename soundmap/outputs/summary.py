@@ -11,6 +11,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from soundmap.losses import when
 from soundmap.outputs.wording import (
     NOTHING,
     chance_text,
@@ -189,11 +190,12 @@ def _losses(losses: Sequence[Mapping[str, Any]]) -> list[RenderableType]:
     if not losses:
         return [Text("Nothing was lost.")]
     table = Table(box=box.SIMPLE, title_justify="left", pad_edge=False)
-    for title in ("", "times", "what", "where", "what was done"):
+    for title in ("", "times", "when", "what", "where", "what was done"):
         table.add_column(Text(title), justify="right" if title == "times" else "left")
     for loss in losses:
         kind = "lost" if loss["data_lost"] else "note"
-        cells = (kind, str(loss["count"]), loss["what"], loss["where"], loss["effect"])
+        span = when(loss.get("first_s"), loss.get("last_s"))
+        cells = (kind, str(loss["count"]), span, loss["what"], loss["where"], loss["effect"])
         table.add_row(*(Text(cell, overflow="fold") for cell in cells))
     return [Text(""), Text("Losses and notes", style="bold"), table]
 

@@ -623,7 +623,7 @@ def test_a_log_without_a_single_return_is_of_no_use(log_path):
 
 def test_empty_and_late_scans_are_counted_once_however_often_they_are_read(log_path):
     def lasers(log):
-        for i in range(10):
+        for i in range(20):
             stamp = START_NS + (i if i != 7 else 2) * SECOND // 10
             log.ros2(
                 "/scan",
@@ -635,7 +635,7 @@ def test_empty_and_late_scans_are_counted_once_however_often_they_are_read(log_p
     log = opened(log_path, static, drive, lasers, need_audio=False)
     for _ in range(2):
         times = [scan.time_ns for scan in log.lasers()]
-        assert times == [START_NS + i * SECOND // 10 for i in (0, 1, 2, 3, 5, 6, 8, 9)]
+        assert times == [START_NS + i * SECOND // 10 for i in range(20) if i not in (4, 7)]
     assert what(log) == {"laser scan without ranges": 1, "laser stamp runs backward or repeats": 1}
 
 

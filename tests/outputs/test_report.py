@@ -73,6 +73,8 @@ def test_the_report_is_strict_json_with_the_rows_of_the_table_and_every_loss():
         "count": 1294,
         "effect": "motion taken from the twist",
         "data_lost": True,
+        "first_s": None,
+        "last_s": None,
     }
     assert report["speed"] == pytest.approx(20.0 / 2.5)
     assert report["trajectory"]["usable_share"] == pytest.approx(0.9)
