@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from time import perf_counter
 from typing import Protocol, TypeVar
-
-import numpy as np
-from numpy.typing import NDArray
 
 from soundmap.config import Config, ScanConfig
 from soundmap.detect.fitted_sources import fitted_sources
 from soundmap.detect.source_list import detect_sources
 from soundmap.errors import ConfigError, NothingUsableError
 from soundmap.fuse.accumulate import PowerAccumulator
+from soundmap.fuse.bearing_range import ranges_around
 from soundmap.fuse.power_map import fused_scans, level_reference, power_map_frame
-from soundmap.geometry import Mount, Trajectory
+from soundmap.fuse.surroundings import SurroundingsGatherer
+from soundmap.geometry import Trajectory
 from soundmap.grid import OccupancyGrid
 from soundmap.localize.trajectory import estimate_trajectory
 from soundmap.logs.robot_log import RobotLog, open_log
@@ -25,9 +24,12 @@ from soundmap.map_file import read_map
 from soundmap.mapping.geometric_map import build_map
 from soundmap.outputs.progress import Progress, Stage
 from soundmap.run import Run
-from soundmap.scan.audio_scan import audio_scans
+from soundmap.scan.audio_scan import audio_scans, kept_scans
 from soundmap.scan.spectrum import band_bins
-from soundmap.sound import AudioScan, AudioScans, LevelReference
+from soundmap.sensors import AudioBlock, LaserScan
+
+THREADS = 2
+"""Threads that turn sound into audio scans while the log is read."""
 
 
 def process(
@@ -68,35 +70,43 @@ def process(
     start_ns, duration_s = int(log.odometry.time_ns[0]), log.duration_s
 
     room, trajectory = _placed(log, room, config, start_pose, clock)
-    with clock.stage("scan and fuse", duration_s) as stage:
+    with clock.stage("scan", duration_s) as stage:
+        gatherer = SurroundingsGatherer(log.odometry)
+        measured = _watched(log.measurements(), stage, start_ns)
+        blocks = _audio_of(measured, gatherer.see)
         reference = level_reference(array.pascal_per_count)
-        accumulator = PowerAccumulator(power_map_frame(room, config.fuse.cell_m), reference)
-        keeper = _Keeper()
-        scans = keeper.kept(audio_scans(log.audio(), array, config.scan, losses=log.losses))
-        fused, around_m = 0, []
-        for scan in fused_scans(
-            _watched(scans, stage, start_ns),
-            log.lasers(),
-            trajectory,
-            accumulator,
+        scans = kept_scans(
+            audio_scans(blocks, array, config.scan, losses=log.losses, threads=THREADS),
+            reference,
             array.mount,
-            config.fuse,
-            losses=log.losses,
-        ):
-            fused += scan.point_m is not None
-            around_m.append(scan.around_m)
-    if not len(keeper):
+            config.scan.sub_band_hz,
+        )
+        surroundings = gatherer.gathered()
+    if not len(scans):
         raise NothingUsableError(
             f"{log_path}: the audio is too short or too broken for one audio scan of "
             f"{config.scan.frames} windows."
         )
-    with clock.stage("detect"):
+    with clock.stage("fuse"):
+        accumulator = PowerAccumulator(power_map_frame(room, config.fuse.cell_m), reference)
+        fused = sum(
+            scan.point_m is not None
+            for scan in fused_scans(
+                scans,
+                surroundings,
+                trajectory,
+                accumulator,
+                array.mount,
+                config.fuse,
+                losses=log.losses,
+            )
+        )
         power_map = accumulator.power_map()
-        kept = keeper.audio_scans(reference, array.mount, config.scan.sub_band_hz)
+    with clock.stage("detect"):
         if config.detect.method == "sparse":
-            around = np.array(around_m)
+            around = ranges_around(surroundings, trajectory, scans.time_ns, array.mount)
             sources = fitted_sources(
-                kept, around, trajectory, array, config.scan, config.detect, room=room
+                scans, around, trajectory, array, config.scan, config.detect, room=room
             )
         else:
             sources = detect_sources(power_map, config.detect)
@@ -106,11 +116,11 @@ def process(
         config=config,
         room=room,
         trajectory=trajectory,
-        scans=kept,
+        scans=scans,
         power_map=power_map,
         sources=sources,
         losses=tuple(log.losses),
-        counts=_counts(log, len(trajectory), len(keeper), fused),
+        counts=_counts(log, len(trajectory), len(scans), fused),
         timings_s=clock.timings_s,
         duration_s=duration_s,
     )
@@ -147,43 +157,15 @@ def _check_band(log: RobotLog, scan: ScanConfig) -> None:
         raise ConfigError(f"{log.path}: {error} in [scan].") from None
 
 
-class _Keeper:
-    """Keeps every audio scan that passes, in single precision."""
-
-    def __init__(self) -> None:
-        self._time_ns: list[int] = []
-        self._power: list[NDArray[np.float32]] = []
-        self._sub_bands: list[NDArray[np.float32]] = []
-        self._bearing_rad = np.empty(0)
-
-    def __len__(self) -> int:
-        return len(self._time_ns)
-
-    def kept(self, scans: Iterable[AudioScan]) -> Iterator[AudioScan]:
-        for scan in scans:
-            self._time_ns.append(scan.time_ns)
-            self._power.append(scan.power.astype(np.float32))
-            self._bearing_rad = scan.bearing_rad
-            if scan.sub_bands is not None:
-                self._sub_bands.append(scan.sub_bands.astype(np.float32, copy=False))
-            yield scan
-
-    def audio_scans(
-        self, reference: LevelReference, mount: Mount, sub_band_hz: tuple[float, ...]
-    ) -> AudioScans:
-        time_ns = np.array(self._time_ns, dtype=np.int64)
-        parts = {part.shape for part in self._sub_bands}
-        told = len(parts) == 1 and len(self._sub_bands) == len(time_ns)
-        told &= parts == {(len(sub_band_hz) - 1, len(self._bearing_rad))}
-        return AudioScans(
-            time_ns,
-            self._bearing_rad,
-            np.array(self._power),
-            reference,
-            mount,
-            np.array(self._sub_bands) if told else None,
-            sub_band_hz if told else (),
-        )
+def _audio_of(
+    measured: Iterable[AudioBlock | LaserScan], see: Callable[[LaserScan], None]
+) -> Iterator[AudioBlock]:
+    """The audio among what was measured; laser scans are shown to ``see`` as they come by."""
+    for item in measured:
+        if isinstance(item, LaserScan):
+            see(item)
+        else:
+            yield item
 
 
 class _Stopwatch:

@@ -7,7 +7,6 @@ read, and fused with the scans as in `soundmap.replay`.
 from __future__ import annotations
 
 import secrets
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
@@ -19,6 +18,7 @@ from soundmap.deskew import deskewed_rays
 from soundmap.errors import OutputError, SoundmapError
 from soundmap.fuse.accumulate import PowerAccumulator
 from soundmap.fuse.power_map import fused_scans
+from soundmap.fuse.surroundings import gathered_surroundings
 from soundmap.geometry import FloatArray, transformed
 from soundmap.grid import OccupancyGrid
 from soundmap.logs.robot_log import RobotLog, open_log
@@ -33,7 +33,6 @@ from soundmap.outputs.recording import (
 from soundmap.outputs.stored_run import POWER_RATIO, read_difference, read_run
 from soundmap.run import Run
 from soundmap.sensors import LaserScan
-from soundmap.sound import AudioScan
 
 RUN_FILE, DIFFERENCE_FILE = "run.rrd", "diff.rrd"
 LASER_INTERVAL_NS = 200_000_000
@@ -139,8 +138,8 @@ def _tell_fusion(log: RobotLog, run: Run, drawn: RunRecording) -> None:
     step_ns = span_ns / np.clip(affordable, LEAST_MAPS, MOST_MAPS)
     due_ns = float(run.scans.time_ns[0])
     fused = fused_scans(
-        _scans(run),
-        log.lasers(),
+        run.scans,
+        gathered_surroundings(log.lasers(), log.odometry),
         run.trajectory,
         accumulator,
         mount,
@@ -155,11 +154,6 @@ def _tell_fusion(log: RobotLog, run: Run, drawn: RunRecording) -> None:
             drawn.add_power_map(scan.time_ns, accumulator.power_map())
             due_ns += step_ns
     drawn.add_power_map(int(run.scans.time_ns[-1]), accumulator.power_map())
-
-
-def _scans(run: Run) -> Iterator[AudioScan]:
-    for time_ns, power in zip(run.scans.time_ns.tolist(), run.scans.power, strict=True):
-        yield AudioScan(time_ns, run.scans.bearing_rad, power.astype(np.float64))
 
 
 def _in_map(scan: LaserScan, run: Run, time_ns: int) -> FloatArray:

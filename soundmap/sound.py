@@ -79,14 +79,35 @@ class AudioScan:
         >>> np.degrees(scan.peaks()[0]).round(3).tolist()
         [15.0]
         """
-        before, after = np.roll(self.power, 1), np.roll(self.power, -1)
-        tops = np.flatnonzero((self.power > before) & (self.power >= after))
+        bearing, power = interpolated_peaks(self.power)
+        tops = np.flatnonzero(np.isfinite(bearing))
         tops = tops[np.argsort(-self.power[tops], kind="stable")]
-        before, here, after = before[tops], self.power[tops], after[tops]
-        offset = 0.5 * (before - after) / (before - 2.0 * here + after)
-        spacing = 2.0 * np.pi / len(self.power)
-        bearing = (self.bearing_rad[tops] + offset * spacing) % (2.0 * np.pi)
-        return bearing, here - 0.25 * (before - after) * offset
+        return bearing[tops] % (2.0 * np.pi), power[tops]
+
+
+def interpolated_peaks(power: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Local maxima of many scans over the circle, finer than the bearings are spaced.
+
+    Parameters
+    ----------
+    power : ndarray, shape (..., N)
+        On the bearings 2 pi n / N [linear].
+
+    Returns
+    -------
+    bearing_rad : ndarray, shape (..., N)
+        Where a bearing is louder than both of its neighbours, the vertex of the parabola through
+        the three, within half a spacing of it [rad]; NaN elsewhere.
+    power : ndarray, shape (..., N)
+        That of the vertex [linear]; NaN elsewhere.
+    """
+    before, after = np.roll(power, 1, axis=-1), np.roll(power, -1, axis=-1)
+    is_top = (power > before) & (power >= after)
+    curvature = np.where(is_top, before - 2.0 * power + after, np.nan)
+    offset = 0.5 * (before - after) / curvature
+    spacing = 2.0 * np.pi / power.shape[-1]
+    bearing = (np.arange(power.shape[-1]) + offset) * spacing
+    return bearing, power - 0.25 * (before - after) * offset
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,7 @@ def log(monkeypatch, run):
             ranges = seen_from(run.trajectory.at(time_ns), bearing)
             yield LaserScan(time_ns, 0.0, bearing, ranges, 30.0, Mount.planar(0, 0, 0, 0), 0)
 
-    opened = SimpleNamespace(fingerprint=run.fingerprint, lasers=lasers)
+    opened = SimpleNamespace(fingerprint=run.fingerprint, lasers=lasers, odometry=run.trajectory)
     monkeypatch.setattr(soundmap.retelling, "open_log", lambda path, config: opened)
     return opened
 

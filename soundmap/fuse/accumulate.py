@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from soundmap.geometry import FloatArray
 from soundmap.grid import GridFrame
 from soundmap.sound import LevelReference, PowerMap
 
@@ -100,10 +99,3 @@ class PowerAccumulator:
             self._reference,
             self._square_sum.copy(),
         )
-
-
-def strongest_candidate(emitted: FloatArray) -> int | None:
-    """Index m of the greatest emitted power :math:`C_m`, or None if no bearing has any."""
-    if not np.isfinite(emitted).any():
-        return None
-    return int(np.nanargmax(emitted))

@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from soundmap.config import FuseConfig
-from soundmap.deskew import deskewed_rays
-from soundmap.fuse.accumulate import PowerAccumulator, strongest_candidate
-from soundmap.fuse.bearing_range import ranges_on_bearings
+from soundmap.fuse.accumulate import PowerAccumulator
+from soundmap.fuse.bearing_range import AGE_NS, surface_ranges
 from soundmap.fuse.emitted_power import emitted_power
 from soundmap.geometry import FloatArray, Mount, Trajectory, transformed
 from soundmap.grid import GridFrame, OccupancyGrid
 from soundmap.losses import LossLedger
-from soundmap.sensors import LaserScan
-from soundmap.sound import AudioScan, LevelReference
+from soundmap.sound import AudioScans, LevelReference, interpolated_peaks
+from soundmap.surroundings import Surroundings
 
 STAGE = "fuse"
-DIRECTIONS = 360
-"""Directions around the array in which the surroundings of each scan are kept."""
-LASER_AGE_NS = 200_000_000
-"""A laser scan farther from an audio scan than this no longer shows the same surroundings."""
+CHUNK = 1024
+"""Scans whose candidates are worked out at a time; bounds the memory of long runs."""
 
 
 @dataclass(frozen=True)
@@ -41,16 +37,12 @@ class FusedScan:
         Where its strongest candidate lies in the map frame [m]; None if it added nothing.
     power : float
         :math:`C_m` [linear]; NaN if it added nothing.
-    around_m : ndarray of float32, shape (M,)
-        Range to the first surface all around, on the array's own bearings 2 pi m / M [m]; NaN
-        where unknown.
     """
 
     time_ns: int
     pose: FloatArray
     point_m: FloatArray | None
     power: float
-    around_m: NDArray[np.float32]
 
 
 def power_map_frame(room: OccupancyGrid, cell_m: float) -> GridFrame:
@@ -62,8 +54,8 @@ def power_map_frame(room: OccupancyGrid, cell_m: float) -> GridFrame:
 
 
 def fused_scans(
-    scans: Iterable[AudioScan],
-    lasers: Iterable[LaserScan],
+    scans: AudioScans,
+    surroundings: Surroundings,
     trajectory: Trajectory,
     accumulator: PowerAccumulator,
     array_mount: Mount,
@@ -74,14 +66,14 @@ def fused_scans(
     r"""Adds every audio scan to the accumulator, and tells what became of it.
 
     After each scan the accumulator holds the power map so far. The ranges :math:`\rho_n` come
-    from the laser scans of all scanners nearest in time, each ray taken from its own time to the
-    audio scan's; the array's own pose at that time turns bearing and range into a place.
+    from the laser points nearest in time, taken along with the robot's motion to the audio scan's;
+    the array's own pose at that time turns bearing and range into a place.
 
     Parameters
     ----------
-    scans : iterable of AudioScan
-    lasers : iterable of LaserScan
-        Both ordered by time.
+    scans : AudioScans
+        Ordered by time.
+    surroundings : Surroundings
     trajectory : Trajectory
         Base in the map frame.
     accumulator : PowerAccumulator
@@ -94,46 +86,37 @@ def fused_scans(
     ------
     FusedScan
     """
-    nearest = _NearestScans(lasers)
-    directions = array_mount.base_bearing(2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS)
-    unknown = np.full(DIRECTIONS, np.nan, dtype=np.float32)
-    for scan in scans:
-        pose = trajectory.at(scan.time_ns)
-        nothing = FusedScan(scan.time_ns, pose, None, np.nan, unknown)
-        around = nearest.at(scan.time_ns)
-        if not np.isfinite(pose).all():
-            losses.remark(
-                "audio scan before the first or after the last laser scan used",
-                STAGE,
-                effect="not fused",
-            )
-            yield nothing
-            continue
-        if not trajectory.usable_at(scan.time_ns):
-            losses.add("audio scan without a trusted pose", STAGE, effect="not fused")
-            yield nothing
-            continue
-        if not around:
-            losses.add("audio scan without a laser scan at its time", STAGE, effect="not fused")
-            yield nothing
-            continue
-        rays = [deskewed_rays(laser, trajectory, scan.time_ns) for laser in around]
-        points = np.concatenate([swept.end_m for swept in rays]) - array_mount.translation_m[:2]
-        ranges = ranges_on_bearings(points, directions, tolerance_rad=np.pi / DIRECTIONS)
-        seen = ranges.astype(np.float32)
-        nothing = FusedScan(scan.time_ns, pose, None, np.nan, seen)
-        candidate = _candidate(scan, pose, points, array_mount, config)
-        if candidate is None:
-            losses.remark("audio scan without a surface in range", STAGE, effect="not fused")
-            yield nothing
-            continue
-        point, power, distance = candidate
-        spacing = 2.0 * np.pi / len(scan.bearing_rad)
-        if accumulator.add(point, power, size_m=spacing * distance):
-            yield FusedScan(scan.time_ns, pose, point, power, seen)
-        else:
-            losses.remark("surface outside the map", STAGE, effect="not fused")
-            yield nothing
+    spacing = 2.0 * np.pi / len(scans.bearing_rad)
+    for start in range(0, len(scans), CHUNK):
+        part = slice(start, start + CHUNK)
+        time_ns = scans.time_ns[part]
+        pose = trajectory.at(time_ns)
+        trusted = trajectory.usable_at(time_ns)
+        seen = surroundings.nearest(time_ns, within_ns=AGE_NS) >= 0
+        power = scans.power[part].astype(np.float64)
+        found = _candidates(power, surroundings, trajectory, time_ns, array_mount, config)
+        point = transformed(pose, found.point_m)
+        for k, time in enumerate(time_ns.tolist()):
+            nothing = FusedScan(time, pose[k], None, np.nan)
+            if not np.isfinite(pose[k]).all():
+                what = "audio scan before the first or after the last laser scan used"
+                losses.remark(what, STAGE, effect="not fused")
+                yield nothing
+            elif not trusted[k]:
+                losses.add("audio scan without a trusted pose", STAGE, effect="not fused")
+                yield nothing
+            elif not seen[k]:
+                what = "audio scan without a laser scan at its time"
+                losses.add(what, STAGE, effect="not fused")
+                yield nothing
+            elif not np.isfinite(found.power[k]):
+                losses.remark("audio scan without a surface in range", STAGE, effect="not fused")
+                yield nothing
+            elif accumulator.add(point[k], found.power[k], size_m=spacing * found.range_m[k]):
+                yield FusedScan(time, pose[k], point[k], float(found.power[k]))
+            else:
+                losses.remark("surface outside the map", STAGE, effect="not fused")
+                yield nothing
 
 
 def level_reference(pascal_per_count: float | None) -> LevelReference:
@@ -143,48 +126,44 @@ def level_reference(pascal_per_count: float | None) -> LevelReference:
     return LevelReference.SOUND_PRESSURE
 
 
-def _candidate(
-    scan: AudioScan,
-    pose: FloatArray,
-    points_m: FloatArray,
+@dataclass(frozen=True)
+class _Candidates:
+    """The strongest candidate of each of S scans; NaN where a scan has none.
+
+    ``point_m`` (S, 2) lies in the base frame [m]; ``power`` and ``range_m`` are (S,).
+    """
+
+    point_m: FloatArray
+    power: FloatArray
+    range_m: FloatArray
+
+
+def _candidates(
+    received: FloatArray,
+    surroundings: Surroundings,
+    trajectory: Trajectory,
+    time_ns: NDArray[np.int64],
     array_mount: Mount,
     config: FuseConfig,
-) -> tuple[FloatArray, float, float] | None:
-    """Place [m, map frame], emitted power and range [m] of the scan's strongest candidate."""
-    centre = array_mount.translation_m[:2]
-    bearing, received = scan.bearing_rad, scan.power
-    spacing = 2.0 * np.pi / len(bearing)
+) -> _Candidates:
+    """Place, emitted power and range of the strongest candidate m of each scan, Eq. (3)."""
+    spacing = 2.0 * np.pi / received.shape[1]
+    bearing = np.broadcast_to(spacing * np.arange(received.shape[1]), received.shape)
     if config.candidates == "peaks":
-        bearing, received = scan.peaks()
-    bearing = array_mount.base_bearing(bearing)
-    ranges = ranges_on_bearings(points_m, bearing, tolerance_rad=0.5 * spacing)
+        bearing, received = interpolated_peaks(received)
+    ranges = surface_ranges(
+        surroundings, trajectory, time_ns, array_mount, bearing, tolerance_rad=0.5 * spacing
+    )
     emitted = emitted_power(
         received, ranges, alpha=config.alpha, d_min=config.d_min_m, d_max=config.d_max_m
     )
-    best = strongest_candidate(emitted)
-    if best is None:
-        return None
-    direction = np.array([np.cos(bearing[best]), np.sin(bearing[best])])
-    point = transformed(pose, centre + ranges[best] * direction)
-    return point, float(emitted[best]), float(ranges[best])
-
-
-class _NearestScans:
-    """For increasing times, the laser scan nearest in time of each scanner."""
-
-    def __init__(self, lasers: Iterable[LaserScan]) -> None:
-        self._lasers = iter(lasers)
-        self._ahead: LaserScan | None = next(self._lasers, None)
-        self._around: deque[LaserScan] = deque()
-
-    def at(self, time_ns: int) -> list[LaserScan]:
-        """Scans within `LASER_AGE_NS` of a time, one a scanner, in the scanners' order."""
-        while self._ahead is not None and self._ahead.middle_ns <= time_ns + LASER_AGE_NS:
-            self._around.append(self._ahead)
-            self._ahead = next(self._lasers, None)
-        while self._around and self._around[0].middle_ns < time_ns - LASER_AGE_NS:
-            self._around.popleft()
-        nearest: dict[int, LaserScan] = {}
-        for scan in sorted(self._around, key=lambda scan: abs(scan.middle_ns - time_ns)):
-            nearest.setdefault(scan.scanner, scan)
-        return [nearest[scanner] for scanner in sorted(nearest)]
+    best = np.argmax(np.where(np.isfinite(emitted), emitted, -np.inf), axis=1)[:, None]
+    power, distance, bearing = (
+        np.take_along_axis(values, best, axis=1)[:, 0]
+        for values in (emitted, ranges.astype(np.float64), bearing)
+    )
+    toward = array_mount.base_bearing(bearing)
+    direction = np.stack([np.cos(toward), np.sin(toward)], axis=-1)
+    return _Candidates(
+        array_mount.translation_m[:2] + distance[:, None] * direction, power, distance
+    )

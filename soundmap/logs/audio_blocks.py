@@ -10,13 +10,59 @@ from numpy.typing import NDArray
 
 from soundmap.logs.audio_messages import PACKET_READERS, block_samples
 from soundmap.logs.audio_stream import AudioStream
-from soundmap.logs.reader import McapLog
+from soundmap.logs.reader import McapLog, Message
 from soundmap.logs.survey import AudioRecord, Survey
 from soundmap.losses import LossLedger
 from soundmap.sensors import AudioBlock
 
 GREATEST_SAMPLE = 1e6
 """Floating-point samples have their full scale at 1; what is beyond all gains is damaged."""
+
+
+class BlockReader:
+    """Turns the messages of the microphones' topic into blocks of audio, in one pass over them.
+
+    Parameters
+    ----------
+    survey, stream
+        Of that topic.
+    channels : ndarray of int, shape (Q,)
+        Which are used.
+    losses : LossLedger
+        Where samples that are no numbers are counted, once however many passes there are.
+    """
+
+    def __init__(
+        self, survey: Survey, stream: AudioStream, channels: NDArray[np.intp], losses: LossLedger
+    ) -> None:
+        self._decoders, self._stream = survey.decoders, stream
+        self._channels, self._losses = channels, losses
+        self._read = PACKET_READERS[stream.topic.form]
+        self._used = iter(stream.message.tolist())
+        self._next_used = next(self._used, -1)
+        self._message, self._block = -1, -1
+
+    def block(self, message: Message) -> AudioBlock | None:
+        """The block of the next message of the topic; None if it is not used."""
+        self._message += 1
+        if self._message != self._next_used:
+            return None
+        self._next_used = next(self._used, -1)
+        self._block += 1
+        stream, clock = self._stream, self._stream.clock
+        if not clock.kept[self._block]:
+            return None
+        packet = self._read(self._decoders.decoder(message.channel)(message.data))
+        samples = block_samples(packet.data, stream.encoding, stream.sample)
+        if len(self._channels) < stream.encoding.channels:
+            samples = samples[:, self._channels]
+        return AudioBlock(
+            time_ns=int(clock.start_ns[self._block]),
+            rate_hz=stream.rate_hz,
+            samples=_without_nonsense(samples, stream, message.log_time_ns, self._losses),
+            full_scale=stream.sample.full_scale,
+            continues=bool(clock.continues[self._block]),
+        )
 
 
 def audio_blocks(
@@ -26,38 +72,12 @@ def audio_blocks(
     channels: NDArray[np.intp],
     losses: LossLedger,
 ) -> Iterator[AudioBlock]:
-    """Blocks of audio in the order of time, by a fresh pass over the log.
-
-    Parameters
-    ----------
-    log, survey, stream
-        Of the microphones' topic.
-    channels : ndarray of int, shape (Q,)
-        Which are used.
-    losses : LossLedger
-        Where samples that are no numbers are counted, once however many passes there are.
-    """
-    clock, name = stream.clock, stream.topic.name
-    read = PACKET_READERS[stream.topic.form]
-    used, block = stream.message.tolist(), 0
-    for number, message in enumerate(log.messages(lambda channel: channel.topic == name)):
-        if block == len(used):
-            return
-        if number != used[block]:
-            continue
-        if clock.kept[block]:
-            packet = read(survey.decoders.decoder(message.channel)(message.data))
-            samples = block_samples(packet.data, stream.encoding, stream.sample)
-            if len(channels) < stream.encoding.channels:
-                samples = samples[:, channels]
-            yield AudioBlock(
-                time_ns=int(clock.start_ns[block]),
-                rate_hz=stream.rate_hz,
-                samples=_without_nonsense(samples, stream, message.log_time_ns, losses),
-                full_scale=stream.sample.full_scale,
-                continues=bool(clock.continues[block]),
-            )
-        block += 1
+    """Blocks of audio in the order of time, by a fresh pass over the log; see `BlockReader`."""
+    reader, name = BlockReader(survey, stream, channels, losses), stream.topic.name
+    for message in log.messages(lambda channel: channel.topic == name):
+        block = reader.block(message)
+        if block is not None:
+            yield block
 
 
 def _without_nonsense(

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from soundmap.config import Config
 from soundmap.geometry import FloatArray, Mount, Trajectory
 from soundmap.logs.array_health import array_health, without_faulty
-from soundmap.logs.audio_blocks import audio_blocks
+from soundmap.logs.audio_blocks import BlockReader, audio_blocks
 from soundmap.logs.audio_stream import AudioStream, audio_stream, microphone_array
 from soundmap.logs.coverage import count_silences
 from soundmap.logs.laser_messages import SWEEP_READERS, LaserSweep, valid_ranges
@@ -81,26 +81,7 @@ class RobotLog:
 
     def lasers(self) -> Iterator[LaserScan]:
         """Scans of all scanners by the time of their first ray; a fresh pass every call."""
-        waiting: list[tuple[int, int, LaserScan]] = []
-        room = SCANS_HELD * len(self.scanners)
-        for scan in self._scans_as_logged():
-            heapq.heappush(waiting, (scan.time_ns, scan.scanner, scan))
-            if len(waiting) > room:
-                yield heapq.heappop(waiting)[2]
-        while waiting:
-            yield heapq.heappop(waiting)[2]
-
-    def _scans_as_logged(self) -> Iterator[LaserScan]:
-        readers = {
-            stream.topic.name: _ScanReader(stream, index)
-            for index, stream in enumerate(self._laser_streams)
-        }
-        decoders = self._survey.decoders
-        for message in self._log.messages(lambda channel: channel.topic in readers):
-            reader = readers[message.channel.topic]
-            time_ns = reader.next_time()
-            if time_ns != DAMAGED:
-                yield reader.scan(decoders.decoder(message.channel)(message.data), time_ns)
+        return (item for item in self._measured(None) if isinstance(item, LaserScan))
 
     def audio(self) -> Iterator[AudioBlock]:
         """Blocks of audio in the order of time; a fresh pass every call.
@@ -110,10 +91,51 @@ class RobotLog:
         ValueError
             The log was opened without audio.
         """
-        stream = self._audio_stream
-        if stream is None:
-            raise ValueError("the log was opened without audio")
+        stream = self._needed_audio()
         return audio_blocks(self._log, self._survey, stream, self._channels, self.losses)
+
+    def measurements(self) -> Iterator[AudioBlock | LaserScan]:
+        """What :meth:`audio` and :meth:`lasers` give, in one pass; each of them in its own order.
+
+        Raises
+        ------
+        ValueError
+            The log was opened without audio.
+        """
+        return self._measured(self._needed_audio())
+
+    def _needed_audio(self) -> AudioStream:
+        if self._audio_stream is None:
+            raise ValueError("the log was opened without audio")
+        return self._audio_stream
+
+    def _measured(self, audio: AudioStream | None) -> Iterator[AudioBlock | LaserScan]:
+        """Laser scans in the order of time, and between them blocks of audio as logged."""
+        blocks = None
+        if audio is not None:
+            blocks = BlockReader(self._survey, audio, self._channels, self.losses)
+        audio_name = audio.topic.name if audio is not None else ""
+        lasers = {
+            stream.topic.name: _ScanReader(stream, index)
+            for index, stream in enumerate(self._laser_streams)
+        }
+        decoders, room = self._survey.decoders, SCANS_HELD * len(lasers)
+        waiting: list[tuple[int, int, LaserScan]] = []
+        for message in self._log.messages(lambda c: c.topic in lasers or c.topic == audio_name):
+            if blocks is not None and message.channel.topic == audio_name:
+                if (block := blocks.block(message)) is not None:
+                    yield block
+                continue
+            reader = lasers[message.channel.topic]
+            time_ns = reader.next_time()
+            if time_ns == DAMAGED:
+                continue
+            scan = reader.scan(decoders.decoder(message.channel)(message.data), time_ns)
+            heapq.heappush(waiting, (scan.time_ns, scan.scanner, scan))
+            if len(waiting) > room:
+                yield heapq.heappop(waiting)[2]
+        while waiting:
+            yield heapq.heappop(waiting)[2]
 
 
 class _ScanReader:

@@ -19,14 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soundmap.config import ScanConfig
-from soundmap.geometry import FloatArray
+from soundmap.geometry import FloatArray, Mount
 from soundmap.losses import LossLedger
 from soundmap.scan.cross_spectra import BaselineSpectra
 from soundmap.scan.response import steered_response_power, whitened_spectra
 from soundmap.scan.spectrum import Framing, band_bins, hann_power
 from soundmap.scan.steering import SteeringTable, steering_table
 from soundmap.sensors import AudioBlock, MicArray
-from soundmap.sound import REFERENCE_PRESSURE_PA, AudioScan
+from soundmap.sound import REFERENCE_PRESSURE_PA, AudioScan, AudioScans, LevelReference
 
 BATCH = 32
 """Scans that are steered by one matrix product; a shorter batch is filled up with nothing, so that
@@ -100,6 +100,38 @@ def audio_scans(
         yield from _scans(workers, stream, scanner, losses, last=True)
         while (batch := workers.next_result(wait=True)) is not None:
             yield from _finite(batch, losses)
+
+
+def kept_scans(
+    scans: Iterable[AudioScan],
+    reference: LevelReference,
+    mount: Mount,
+    sub_band_hz: tuple[float, ...] = (),
+) -> AudioScans:
+    """All audio scans of a run, in single precision; none without bearings if there are none.
+
+    The sub-bands are kept where all scans tell those that are asked for.
+    """
+    time_ns: list[int] = []
+    power: list[NDArray[np.float32]] = []
+    sub_bands: list[NDArray[np.float32]] = []
+    bearing_rad = np.empty(0)
+    for scan in scans:
+        time_ns.append(scan.time_ns)
+        power.append(scan.power.astype(np.float32))
+        bearing_rad = scan.bearing_rad
+        if scan.sub_bands is not None and len(scan.sub_bands) == len(sub_band_hz) - 1:
+            sub_bands.append(scan.sub_bands.astype(np.float32, copy=False))
+    told = len(sub_bands) == len(time_ns) > 0
+    return AudioScans(
+        np.array(time_ns, dtype=np.int64),
+        bearing_rad,
+        np.array(power, dtype=np.float32).reshape(len(power), len(bearing_rad)),
+        reference,
+        mount,
+        np.array(sub_bands) if told else None,
+        sub_band_hz if told else (),
+    )
 
 
 def _scans(

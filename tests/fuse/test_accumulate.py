@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from soundmap.fuse.accumulate import PowerAccumulator, neighbourhood, strongest_candidate
+from soundmap.fuse.accumulate import PowerAccumulator, neighbourhood
 from soundmap.grid import GridFrame
 from soundmap.sound import LevelReference
 
@@ -71,9 +71,3 @@ def test_neighbourhood_is_a_disc_about_the_cell(size):
     assert sorted(map(tuple, offsets)) == sorted(map(tuple, -offsets))
     area = np.pi * (size / 2) ** 2 / 0.05**2
     assert len(offsets) == pytest.approx(area, rel=0.35, abs=2)
-
-
-def test_strongest_candidate_ignores_bearings_that_are_not_measured():
-    assert strongest_candidate(np.array([np.nan, 1.0, 3.0, np.nan])) == 2
-    assert strongest_candidate(np.full(4, np.nan)) is None
-    assert strongest_candidate(np.empty(0)) is None

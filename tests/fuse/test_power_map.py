@@ -5,10 +5,11 @@ import worlds
 from soundmap.config import FuseConfig
 from soundmap.fuse.accumulate import PowerAccumulator
 from soundmap.fuse.power_map import fused_scans, power_map_frame
+from soundmap.fuse.surroundings import gathered_surroundings
 from soundmap.geometry import Mount, Trajectory, transformed
 from soundmap.grid import GridFrame
 from soundmap.losses import LossLedger
-from soundmap.sound import AudioScan, LevelReference
+from soundmap.sound import AudioScans, LevelReference
 
 TRUTH = worlds.driven([(1.0, 1.0), (5.0, 1.0), (5.0, 2.2)])
 SCANS = worlds.laser_scans(TRUTH, [worlds.FRONT, worlds.BACK], beams=721)
@@ -19,20 +20,26 @@ ARRAY = Mount.planar(0.1, -0.05, 0.6, np.radians(30.0))
 
 def heard(source, truth, mount, *, step_ns=100_000_000):
     """Audio scans of a single source: one lobe toward it, falling with the square of distance."""
+    times, powers = [], []
     for time_ns in range(int(truth.time_ns[0]) + step_ns, int(truth.time_ns[-1]), step_ns):
         pose = truth.at(time_ns)
         centre = transformed(pose, mount.translation_m[:2])
         toward = np.arctan2(source[1] - centre[1], source[0] - centre[0]) - pose[2]
         own = mount.handedness * (toward - mount.yaw_rad)
         power = np.exp(10 * (np.cos(BEARING - own) - 1)) / np.sum((source - centre) ** 2)
-        yield AudioScan(time_ns, BEARING, power)
+        times.append(time_ns)
+        powers.append(power)
+    return AudioScans(
+        np.array(times), BEARING, np.array(powers, np.float32), LevelReference.FULL_SCALE, mount
+    )
 
 
 def fused(scans, *, lasers=SCANS, truth=TRUTH, mount=ARRAY, losses=None, **options):
     accumulator = PowerAccumulator(FRAME, LevelReference.FULL_SCALE)
     losses = LossLedger() if losses is None else losses
+    around = gathered_surroundings(lasers, TRUTH)
     events = list(
-        fused_scans(scans, lasers, truth, accumulator, mount, FuseConfig(**options), losses=losses)
+        fused_scans(scans, around, truth, accumulator, mount, FuseConfig(**options), losses=losses)
     )
     return accumulator.power_map(), events
 
@@ -77,7 +84,7 @@ def test_turning_the_world_turns_the_map():
     accumulator = PowerAccumulator(GridFrame(0.05, (-6.0, -3.0), (220, 160)), "x")
     turned_events = fused_scans(
         heard(SOURCE, TRUTH, ARRAY),
-        SCANS,
+        gathered_surroundings(SCANS, TRUTH),
         turned,
         accumulator,
         ARRAY,
@@ -95,9 +102,14 @@ def test_the_map_grows_with_every_scan():
     accumulator = PowerAccumulator(FRAME, LevelReference.FULL_SCALE)
     visits = []
     for event in fused_scans(
-        heard(SOURCE, TRUTH, ARRAY), SCANS, TRUTH, accumulator, ARRAY, FuseConfig(),
+        heard(SOURCE, TRUTH, ARRAY),
+        gathered_surroundings(SCANS, TRUTH),
+        TRUTH,
+        accumulator,
+        ARRAY,
+        FuseConfig(),
         losses=LossLedger(),
-    ):  # fmt: skip
+    ):
         visits.append(accumulator.power_map().visits.sum())
         assert (np.diff([0, *visits])[-1] > 0) == (event.point_m is not None)
     assert visits[-1] > 40
