@@ -370,6 +370,7 @@ def test_info_prints_json_or_text(monkeypatch):
         "mounts": {},
         "losses": [],
         "problems": ["no audio"],
+        "ready_for": {"map": False},
     }
     summary = SimpleNamespace(as_dict=lambda: content)
     monkeypatch.setattr(soundmap.logs.summary, "log_summary", lambda _path, _config: summary)

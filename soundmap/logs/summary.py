@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from soundmap.config import Config
-from soundmap.errors import SoundmapError
+from soundmap.errors import NothingUsableError, SoundmapError
 from soundmap.geometry import Mount, wrapped_angle
 from soundmap.logs.array_health import array_health, without_faulty
 from soundmap.logs.audio_blocks import audio_blocks
@@ -29,7 +29,8 @@ from soundmap.logs.streams import (
     laser_streams,
     odometry_stream,
 )
-from soundmap.logs.survey import Survey
+from soundmap.logs.survey import Survey, Topic
+from soundmap.logs.timing import Timing, timing
 from soundmap.losses import Loss, LossLedger
 
 Found = TypeVar("Found")
@@ -37,13 +38,20 @@ Found = TypeVar("Found")
 
 @dataclass(frozen=True)
 class TopicSummary:
-    """One topic: type, encoding, messages, mean rate [Hz], what it carries, whether it is used."""
+    """One topic: type, encoding, messages, regularity, what it carries, whether it is used.
+
+    See :class:`soundmap.logs.timing.Timing`.
+    """
 
     name: str
     schema: str
     encoding: str
     messages: int
     rate_hz: float
+    gaps: int
+    longest_gap_s: float
+    jitter_s: float
+    drift_ppm: float | None
     kind: str
     used: bool
     problem: str
@@ -66,7 +74,7 @@ class AudioSummary:
     gaps: int
     lost_s: float
     stamp: str
-    level_db: tuple[float, ...]
+    level_db: tuple[float | None, ...]
     unsound_channels: tuple[int, ...]
 
 
@@ -100,7 +108,8 @@ class OdometrySummary:
 class LogSummary:
     """A log at a glance; times in ns since epoch by the log's own clock.
 
-    ``problems`` are what keeps the log, or a part of it, from being used, gravest first.
+    ``problems`` are what keeps the log, or a part of it, from being used, gravest first;
+    ``ready_for`` tells which commands would begin; lost data comes before remarks in ``losses``.
     """
 
     path: Path
@@ -116,6 +125,7 @@ class LogSummary:
     mounts: dict[str, Mount]
     losses: tuple[Loss, ...]
     problems: tuple[str, ...]
+    ready_for: dict[str, bool]
 
     def as_dict(self) -> dict[str, Any]:
         """Everything as plain lists, strings and numbers, ready for JSON."""
@@ -133,6 +143,7 @@ class LogSummary:
             "mounts": {frame: list(_planar(mount)) for frame, mount in self.mounts.items()},
             "losses": [asdict(loss) for loss in self.losses],
             "problems": list(self.problems),
+            "ready_for": self.ready_for,
         }
 
 
@@ -148,14 +159,14 @@ def log_summary(path: Path, config: Config) -> LogSummary:
     """
     losses = LossLedger()
     log = McapLog(path, log_files(path), losses)
-    survey = Survey(log)
-    name, problems = str(path), list[str]()
+    survey = Survey(log, keep_times=True)
+    name, problems = str(path), list[SoundmapError]()
 
     def attempted(make: Callable[[], Found]) -> Found | None:
         try:
             return make()
         except SoundmapError as error:
-            problems.append(str(error))
+            problems.append(error)
             return None
 
     odometry = attempted(lambda: odometry_stream(survey, config, name, losses))
@@ -195,9 +206,19 @@ def log_summary(path: Path, config: Config) -> LogSummary:
         odometry=_odometry(odometry) if odometry else None,
         base_frame=mounts.base or None,
         mounts=_known_mounts(mounts),
-        losses=tuple(losses),
-        problems=tuple(problems),
+        losses=tuple(sorted(losses, key=lambda loss: not loss.data_lost)),
+        problems=tuple(str(error) for error in sorted(problems, key=_gravity)),
+        ready_for={
+            "map": bool(odometry and lasers),
+            "localize": bool(odometry and lasers),
+            "process": not problems,
+        },
     )
+
+
+def _gravity(error: SoundmapError) -> int:
+    """What a setting can mend comes after what is not in the log."""
+    return 0 if isinstance(error, NothingUsableError) else 1
 
 
 def _mounts_without_odometry(survey: Survey, config: Config, name: str) -> Mounts:
@@ -233,13 +254,21 @@ def _topics(survey: Survey, used: set[str]) -> tuple[TopicSummary, ...]:
             schema=topic.schema,
             encoding=topic.encoding,
             messages=topic.messages,
-            rate_hz=_rate(topic.messages, topic.last_ns - topic.first_ns),
+            **asdict(_timing(topic)),
             kind=str(topic.kind),
             used=topic.name in used or topic.kind is Kind.AUDIO_INFO,
             problem=topic.problem,
         )
         for topic in sorted(survey.topics.values(), key=lambda t: t.name)
     )
+
+
+def _timing(topic: Topic) -> Timing:
+    record = topic.record
+    stamps = None
+    if record is not None and len(record.stamp_ns) == len(topic.logged_ns):
+        stamps = np.array(record.stamp_ns, dtype=np.int64)
+    return timing(np.array(topic.logged_ns, dtype=np.int64), stamps)
 
 
 def _audio(stream: AudioStream, health: MicrophoneHealth | None) -> AudioSummary:
@@ -254,9 +283,13 @@ def _audio(stream: AudioStream, health: MicrophoneHealth | None) -> AudioSummary
         gaps=clock.gaps,
         lost_s=clock.lost_s,
         stamp="start" if stream.stamp_is_start else "end",
-        level_db=tuple(health.level_db.tolist()) if health else (),
+        level_db=_levels(health) if health else (),
         unsound_channels=tuple(np.flatnonzero(~health.sound).tolist()) if health else (),
     )
+
+
+def _levels(health: MicrophoneHealth) -> tuple[float | None, ...]:
+    return tuple(level if np.isfinite(level) else None for level in health.level_db.tolist())
 
 
 def _laser(stream: LaserStream) -> LaserSummary:

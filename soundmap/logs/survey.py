@@ -149,7 +149,8 @@ class LaserRecord:
 class Topic:
     """One topic of the log.
 
-    ``problem`` says why messages cannot be read, if so; ``record`` depends on the kind.
+    ``problem`` says why messages cannot be read, if so; ``record`` depends on the kind;
+    ``logged_ns`` is kept only if that was asked for.
     """
 
     name: str
@@ -161,6 +162,7 @@ class Topic:
     built_in: bool = False
     first_ns: int = 0
     last_ns: int = 0
+    logged_ns: array[int] = field(default_factory=lambda: array("q"))
     record: AudioRecord | LaserRecord | OdometryRecord | None = None
     info: AudioEncoding | None = None
 
@@ -225,13 +227,13 @@ class Survey:
     messages : int
     """
 
-    def __init__(self, log: McapLog, *, need_audio: bool = True) -> None:
+    def __init__(self, log: McapLog, *, need_audio: bool = True, keep_times: bool = False) -> None:
         self.topics: dict[str, Topic] = {}
         self.transforms = TransformRecord()
         self.decoders = Decoders()
         self.losses = log.losses
         self.start_ns = self.end_ns = self.messages = 0
-        self._need_audio = need_audio
+        self._need_audio, self._keep_times = need_audio, keep_times
         self._takers: dict[Channel, Callable[[Message], None]] = {}
         for message in log.messages():
             taker = self._takers.get(message.channel)
@@ -282,6 +284,8 @@ class Survey:
                 topic.first_ns = topic.last_ns = time
             topic.messages += 1
             topic.first_ns, topic.last_ns = min(topic.first_ns, time), max(topic.last_ns, time)
+            if self._keep_times:
+                topic.logged_ns.append(time)
             if take is None or decode is None:
                 self._skip(topic, time)
                 return

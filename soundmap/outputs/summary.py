@@ -119,29 +119,34 @@ def map_view(report: Mapping[str, Any]) -> RenderableType:
 
 def log_view(summary: Mapping[str, Any]) -> RenderableType:
     """What a log holds and what of it would be used, from the summary's plain form."""
-    topics = _table("topic", align_right=("messages", "rate [Hz]"), left=("schema", "used as"))
+    right = ("count", "[Hz]", "jitter [ms]", "gaps")
+    topics = _table("topic", align_right=right, left=("schema", "used as"))
     for topic in summary["topics"]:
         topics.add_row(
             Text(topic["name"], overflow="fold"),
             str(topic["messages"]),
             number_text(topic["rate_hz"], 1),
-            Text(topic["schema"], overflow="fold"),
+            number_text(1e3 * topic["jitter_s"], 2),
+            str(topic["gaps"]),
+            Text(topic["schema"].replace("/msg/", "/"), overflow="fold"),
             topic["kind"] if topic["used"] else "-",
         )
     lasers = enumerate(summary["lasers"], start=1)
     mounts = summary["mounts"].items()
     found = {
-        "Audio": _described(summary["audio"]),
+        "Audio": _audio_described(summary["audio"]),
         **{f"Laser {number}": _described(laser) for number, laser in lasers},
         "Odometry": _described(summary["odometry"]),
         "Base frame": _value(summary["base_frame"]),
         **{f"Mount of {frame}": _placed(mount) for frame, mount in mounts},
     }
     problems = [Text(f"- {problem}") for problem in summary["problems"]]
+    ready = [command for command, yes in summary["ready_for"].items() if yes]
     return Group(
         Text(
             f"{summary['path']}: {summary['duration_s']:.1f} s, "
-            f"{summary['size_bytes'] / 1e6:.1f} MB"
+            f"{summary['size_bytes'] / 1e6:.1f} MB, "
+            f"ready for {', '.join(ready) or 'nothing'}"
         ),
         topics,
         _lines(found),
@@ -224,6 +229,19 @@ def _described(thing: Mapping[str, Any] | None) -> str:
         return "none"
     fields = {name: value for name, value in thing.items() if name != "mount"}
     return ", ".join(f"{_words(name)} {_value(value)}" for name, value in fields.items())
+
+
+def _audio_described(audio: Mapping[str, Any] | None) -> str:
+    """The microphones on one line, with the span of their levels."""
+    if audio is None:
+        return "none"
+    lists = ("level_db", "unsound_channels")
+    known = [level for level in audio["level_db"] if level is not None]
+    texts = [_described({name: value for name, value in audio.items() if name not in lists})]
+    if known:
+        texts.append(f"levels {min(known):.1f} to {max(known):.1f} dB re (full scale)^2")
+    unsound = ", ".join(str(channel) for channel in audio["unsound_channels"])
+    return ", ".join([*texts, f"channels left out: {unsound or 'none'}"])
 
 
 def _placed(mount: Sequence[float]) -> str:

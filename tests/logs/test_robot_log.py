@@ -960,7 +960,33 @@ def test_a_summary_tells_what_is_there_and_what_is_used(log_path):
     assert summary.odometry.distance_m == pytest.approx(SPEED * SECONDS, rel=1e-3)
     assert summary.odometry.turn_rad == pytest.approx(SPEED / RADIUS * SECONDS, rel=1e-6)
     assert summary.lasers[0].mount == pytest.approx((0.2, 0.0, 0.3, 0.1))
+    assert summary.ready_for == {"map": True, "localize": True, "process": True}
     assert dataclasses.replace(summary) == summary
+
+
+def test_a_health_check_tells_rates_gaps_jitter_drift_and_levels(log_path):
+    def late(log):
+        rng = np.random.default_rng(1)
+        for i in range(600):
+            if not 200 <= i < 220:
+                stamp = START_NS + int(i * 0.05 * SECOND + 1e5 * rng.standard_normal())
+                # The log's clock is 200 ppm slow against that of the stamps.
+                logged = START_NS + int(i * 0.05 * SECOND * (1 - 2e-4)) + 2_000_000
+                log.ros2(
+                    "/scan", "sensor_msgs/msg/LaserScan", laser_scan(stamp, "laser", RANGES), logged
+                )
+
+    summary = log_summary(written(log_path, static, drive, late, frames), CONFIG)
+    scan = next(topic for topic in summary.topics if topic.name == "/scan")
+    assert (scan.messages, scan.gaps) == (580, 1)
+    assert scan.longest_gap_s == pytest.approx(1.05, abs=0.01)
+    assert scan.jitter_s == pytest.approx(1.4e-4, rel=0.2)
+    assert scan.drift_ppm == pytest.approx(200.0, abs=10.0)
+    levels = 10 * np.log10(np.mean((DATA / 2**15) ** 2, axis=0))
+    np.testing.assert_allclose(summary.audio.level_db, levels, atol=0.5)
+    lost = [loss.data_lost for loss in summary.losses]
+    assert lost == sorted(lost, reverse=True)
+    json.dumps(summary.as_dict(), allow_nan=False)
 
 
 # The lab

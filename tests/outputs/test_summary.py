@@ -97,6 +97,8 @@ def log_summary() -> dict:
                 "encoding": "cdr",
                 "messages": 667,
                 "rate_hz": 25.0,
+                "gaps": 2,
+                "jitter_s": 0.00034,
                 "kind": "audio",
                 "used": True,
             },
@@ -106,25 +108,40 @@ def log_summary() -> dict:
                 "encoding": "cdr",
                 "messages": 3,
                 "rate_hz": None,
+                "gaps": 0,
+                "jitter_s": 0.0,
                 "kind": None,
                 "used": False,
             },
         ],
-        "audio": {"topic": "/audio/raw", "channels": 16, "drift_ppm": -31.25, "stamp": "end"},
+        "audio": {
+            "topic": "/audio/raw",
+            "channels": 16,
+            "drift_ppm": -31.25,
+            "stamp": "end",
+            "level_db": [-31.04, None, -28.0],
+            "unsound_channels": [1],
+        },
         "lasers": [{"topic": "/scan[front]", "beams": 1081, "upside_down": True}],
         "odometry": None,
         "base_frame": "base_link",
         "mounts": {"laser": [0.2, -0.1, 0.3, 1.5707963]},
         "losses": [],
         "problems": ["no odometry: give [topics] odometry"],
+        "ready_for": {"map": True, "localize": True, "process": False},
     }
 
 
 def test_the_view_of_a_log_shows_topics_sensors_and_problems():
     text = printed(log_view(log_summary()))
     lines = [line.split() for line in text.splitlines()]
-    assert "run1.mcap: 26.7 s, 12.3 MB" in text
-    assert any(line[:3] == ["/audio/raw", "667", "25.0"] and line[-1] == "audio" for line in lines)
+    assert "run1.mcap: 26.7 s, 12.3 MB, ready for map, localize" in text
+    assert "levels -31.0 to -28.0 dB" in text
+    assert "left out: 1" in " ".join(text.split())
+    assert any(
+        line[:5] == ["/audio/raw", "667", "25.0", "0.34", "2"] and line[-1] == "audio"
+        for line in lines
+    )
     assert any(line[:3] == ["/rosout", "3", "-"] and line[-1] == "-" for line in lines)
     assert "channels 16, drift ppm -31.25" in text
     assert "/scan[front]" in text
