@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
-from soundmap.outputs.level_plot import level_plot
+from soundmap.outputs.level_plot import Dot, level_plot
 from soundmap.outputs.wording import (
     NOTHING,
     chance_text,
@@ -29,10 +29,10 @@ def sources_table(report: Mapping[str, Any]) -> str:
     unit = printed_reference(report["level_reference"])
     columns = {
         "Source": [row["id"] for row in rows],
+        "Level [dB]": [level_text(row) for row in rows],
         "x [m]": [number_text(row["x_m"], 3) for row in rows],
         "y [m]": [number_text(row["y_m"], 3) for row in rows],
         "95 % within [cm]": [place_error_text(row) for row in rows],
-        "Level [dB]": [level_text(row) for row in rows],
         "Visits": [str(row["visits"]) for row in rows],
         "Heard over [°]": [number_text(row.get("arc_deg"), 0) for row in rows],
         "By chance": [chance_text(row.get("false_alarm_probability")) for row in rows],
@@ -45,7 +45,10 @@ def sources_table(report: Mapping[str, Any]) -> str:
             " 95 % within: half the axes of the ellipse that holds the place. By chance: "
             "probability that a run without any source would show as much."
         )
-    return level_plot(rows, "power_db", "level_sigma_db", unit) + _note(note) + _told(columns)
+    dots = [
+        Dot(row["id"], row["power_db"], row.get("level_sigma_db"), level_text(row)) for row in rows
+    ]
+    return level_plot(dots, unit) + _note(note) + _told(columns)
 
 
 def reflections_table(report: Mapping[str, Any]) -> str:
@@ -70,9 +73,9 @@ def changes_table(report: Mapping[str, Any]) -> str:
     columns = {
         "Place": [row["id"] for row in rows],
         "Change": [row["kind"] for row in rows],
+        "Louder by [dB]": [ratio_text(row) for row in rows],
         "x [m]": [number_text(row["x_m"], 3) for row in rows],
         "y [m]": [number_text(row["y_m"], 3) for row in rows],
-        "Louder by [dB]": [ratio_text(row) for row in rows],
         "By chance": [chance_text(row.get("false_alarm_probability")) for row in rows],
         report["run"]: [row.get("id_in_run") or NOTHING for row in rows],
         report["background"]: [row.get("id_in_background") or NOTHING for row in rows],
@@ -83,7 +86,10 @@ def changes_table(report: Mapping[str, Any]) -> str:
         "them was silent there. By chance: probability that two runs of an unchanged site would "
         "show as much anywhere."
     )
-    return level_plot(rows, "ratio_db", "ratio_sigma_db", "louder by [dB]") + note + _told(columns)
+    dots = [
+        Dot(row["id"], row["ratio_db"], row.get("ratio_sigma_db"), ratio_text(row)) for row in rows
+    ]
+    return level_plot(dots, "louder by [dB]", with_zero=True) + note + _told(columns)
 
 
 def html_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -25,12 +25,13 @@ from soundmap.outputs.wording import NOTHING, number_text, printed_reference
 KINDS = ("appeared", "louder", "quieter", "gone", "unchanged", "untold")
 CAPTIONS = {
     "power_map": "Where it is loud: mean emitted power over the geometric map. Cells without "
-    "colour were not measured, or too rarely to count; they need not be quiet.",
+    "colour were not measured, or too rarely to count; they need not be quiet. Ellipses hold their "
+    "source with 95 %; they are drawn where that is more than the mark covers.",
     "trajectory": "Where the robot was: its way in the geometric map, with the sources found.",
     "audio_scans": "What the array heard: level on every bearing over time, and below it the "
     "level of the loudest bearing and the mean of all.",
     "power_ratio": "What changed: red is louder than the background, blue is quieter, no colour "
-    "was not measured.",
+    "was not measured. Pale cells differ no more than chance may make them.",
 }
 STYLE = """
 :root { color-scheme: light; }
@@ -135,7 +136,7 @@ def _run_facts(report: Mapping[str, Any]) -> list[tuple[str, str, bool]]:
             share is None or share < 0.95,
         ),
         (f"{way['length_m']:.1f} m", f"driven in {number_text(report['duration_s'], 1)} s", False),
-        (str(lost) if lost else "none", "kinds of data lost", lost > 0),
+        (str(lost or "none"), "kind of data lost" if lost == 1 else "kinds of data lost", lost > 0),
     ]
 
 

@@ -3,35 +3,58 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from html import escape
-from typing import Any
 
 SHOWN_ROWS = 20
-WIDTH, ROW, LEFT, RIGHT = 560, 24, 46, 90
+WIDTH, ROW, LEFT, RIGHT = 560, 24, 46, 104
 STEPS_DB = (0.5, 1, 2, 5, 10, 20, 50)
 
 
-def level_plot(rows: Sequence[Mapping[str, Any]], level: str, error: str, unit: str) -> str:
+@dataclass(frozen=True)
+class Dot:
+    """One row of the plot.
+
+    Attributes
+    ----------
+    name : str
+    level_db : float or None
+        Rows without a level are left out.
+    error_db : float or None
+        Its standard error, if known.
+    written : str
+        The level in words.
+    """
+
+    name: str
+    level_db: float | None
+    error_db: float | None
+    written: str
+
+
+def level_plot(dots: Sequence[Dot], unit: str, *, with_zero: bool = False) -> str:
     """An SVG drawing for a page, or nothing if no row has a level.
 
     Parameters
     ----------
-    rows : sequence of mapping
-        Of ``sources.csv``, loudest first.
-    level : str
-        The column of the level [dB].
-    error : str
-        The column of its standard error [dB], which need not be there.
+    dots : sequence of Dot
+        From top to bottom.
     unit : str
         What stands at the scale.
+    with_zero : bool
+        Whether the scale has to reach 0.
     """
-    shown = [row for row in rows[:SHOWN_ROWS] if row.get(level) is not None]
+    shown = [
+        (dot, dot.level_db, dot.error_db or 0.0)
+        for dot in dots[:SHOWN_ROWS]
+        if dot.level_db is not None
+    ]
     if not shown:
         return ""
-    errors = [row.get(error) or 0.0 for row in shown]
-    low = min(row[level] - off for row, off in zip(shown, errors, strict=True))
-    high = max(row[level] + off for row, off in zip(shown, errors, strict=True))
+    zero = [0.0] if with_zero else []
+    low = min(zero + [level - off for _, level, off in shown])
+    high = max(zero + [level + off for _, level, off in shown])
     step = next((step for step in STEPS_DB if high - low <= 6 * step), 100)
     first, last = math.floor(low / step), math.floor(high / step) + 1
     span = (last - first) * step
@@ -41,20 +64,19 @@ def level_plot(rows: Sequence[Mapping[str, Any]], level: str, error: str, unit: 
 
     bottom = ROW * len(shown) + 6
     parts = [_tick(at(n * step), bottom, f"{n * step:g}") for n in range(first, last + 1)]
-    for number, (row, off) in enumerate(zip(shown, errors, strict=True)):
+    for number, (dot, level, off) in enumerate(shown):
         y = ROW * number + ROW // 2 + 2
-        parts.append(_text(LEFT - 8, y, str(row["id"]), "end", bold=True))
+        parts.append(_text(LEFT - 8, y, dot.name, "end", bold=True))
         if off > 0:
-            ends = f'x1="{at(row[level] - off):.1f}" x2="{at(row[level] + off):.1f}"'
+            ends = f'x1="{at(level - off):.1f}" x2="{at(level + off):.1f}"'
             parts.append(f'<line {ends} y1="{y}" y2="{y}" stroke="#0072B2" stroke-width="2"/>')
-        parts.append(f'<circle cx="{at(row[level]):.1f}" cy="{y}" r="5" fill="#0072B2"/>')
-        written = f"{row[level]:.1f} ± {off:.1f}" if off > 0 else f"{row[level]:.1f}"
-        parts.append(_text(WIDTH - RIGHT + 12, y, f"{written} dB", "start"))
+        parts.append(f'<circle cx="{at(level):.1f}" cy="{y}" r="5" fill="#0072B2"/>')
+        parts.append(_text(WIDTH - RIGHT + 12, y, f"{dot.written} dB", "start"))
     parts.append(_text((LEFT + WIDTH - RIGHT) / 2, bottom + 34, unit, "middle"))
     height = bottom + 46
-    more = len(rows) - len(shown)
+    more = len(dots) - SHOWN_ROWS
     note = f"<p>and {more} more, in the table</p>" if more > 0 else ""
-    title = f"<title>Level of each source [{escape(unit)}]</title>"
+    title = f"<title>{escape(unit)}</title>"
     return (
         f'<svg viewBox="0 0 {WIDTH} {height}" width="{WIDTH}" height="{height}" role="img" '
         f'font-size="13" font-family="system-ui, sans-serif">{title}{"".join(parts)}</svg>{note}'

@@ -6,7 +6,7 @@ from handmade import fitted_run, made_ratio, made_run, unlucky_run
 
 from soundmap.config import DiffConfig
 from soundmap.outputs.html_report import report_html
-from soundmap.outputs.level_plot import level_plot
+from soundmap.outputs.level_plot import Dot, level_plot
 from soundmap.outputs.report import diff_report, run_report
 
 PICTURES = {"power_map": b"\x89PNG first", "trajectory": b"<?xml second"}
@@ -117,18 +117,22 @@ def circles(svg: str) -> list[float]:
 
 
 def test_the_dots_stand_where_the_scale_says():
-    rows = [{"id": "S1", "power_db": 52.0}, {"id": "S2", "power_db": 46.0}]
-    svg = level_plot(rows, "power_db", "level_sigma_db", "dB")
+    svg = level_plot([Dot("S1", 52.0, None, "52.0"), Dot("S2", 46.0, None, "46.0")], "dB")
     ticks = {
         float(value): float(x)
         for x, value in re.findall(r'<text x="([0-9.]+)"[^>]*middle">(-?[0-9.]+)</text>', svg)
     }
     assert circles(svg) == pytest.approx([ticks[52.0], ticks[46.0]], abs=0.1)
+    assert 0.0 not in ticks
+
+
+def test_the_scale_of_differences_reaches_no_difference():
+    svg = level_plot([Dot("S1", 34.0, 0.5, "34")], "dB", with_zero=True)
+    assert ">0</text>" in svg
 
 
 def test_a_known_error_is_drawn_to_both_sides_of_its_level():
-    row = {"id": "S1", "power_db": 50.0, "level_sigma_db": 2.0}
-    svg = level_plot([row], "power_db", "level_sigma_db", "dB")
+    svg = level_plot([Dot("S1", 50.0, 2.0, "50.0 ± 2.0")], "dB")
     start, end = map(float, re.search(r'<line x1="([0-9.]+)" x2="([0-9.]+)" y1="14"', svg).groups())
     assert (start + end) / 2 == pytest.approx(circles(svg)[0], abs=0.1)
     assert end - start > 10
@@ -136,12 +140,11 @@ def test_a_known_error_is_drawn_to_both_sides_of_its_level():
 
 
 def test_a_level_that_is_not_known_has_no_dot():
-    assert level_plot([{"id": "S1", "power_db": None}], "power_db", "sigma", "dB") == ""
-    assert level_plot([], "power_db", "sigma", "dB") == ""
+    assert level_plot([Dot("S1", None, None, "-")], "dB") == ""
+    assert level_plot([], "dB") == ""
 
 
 def test_many_sources_are_cut_short_and_said_so():
-    rows = [{"id": f"S{n}", "power_db": -float(n)} for n in range(30)]
-    svg = level_plot(rows, "power_db", "level_sigma_db", "dB")
+    svg = level_plot([Dot(f"S{n}", -float(n), None, "") for n in range(30)], "dB")
     assert len(circles(svg)) == 20
     assert "and 10 more" in svg
