@@ -327,13 +327,15 @@ def run_markdown(run: Run) -> str:
     usable = f"{100 * run.trajectory.usable.mean():.1f} %" if len(run.trajectory) else "none"
     lines = [f"# {run.log.name}", "", f"{run.duration_s:.1f} s; {usable} of the poses trusted.", ""]
     rows = source_rows(run.sources)
+    remarks = " remarks |" if any(map(flags_text, rows)) else ""
     if rows:
-        lines += [f"| | x [m] | y [m] | level [{unit}] | visits | |", "|---|--:|--:|--:|--:|---|"]
+        lines.append(f"| | x [m] | y [m] | level [{unit}] | visits |{remarks}")
+        lines.append("|---|--:|--:|--:|--:|" + ("---|" if remarks else ""))
     else:
         lines.append("No source was found.")
     lines += [
         f"| {row['id']} | {row['x_m']:.2f} | {row['y_m']:.2f} | {level_text(row)} "
-        f"| {row['visits']} | {flags_text(row)} |"
+        f"| {row['visits']} |" + (f" {flags_text(row)} |" if remarks else "")
         for row in rows
     ]
     lines += ["", "**Lost or noted**", ""]
@@ -411,22 +413,17 @@ def _draw_ellipses(stream: rr.RecordingStream, sources: SourceList) -> None:
 
 
 def _draw_images(stream: rr.RecordingStream, sources: SourceList) -> None:
-    """Mirror images, each with a line to its source if that is known."""
+    """Mirror images; whose they are shows when one is pointed at."""
     images = sources.reflections
     if not images:
         return
     at = _raised(_places([(image.x_m, image.y_m) for image in images]), 4.0 * LINE_Z)
-    dots = rr.Points3D(at, colors=[GREY], radii=rr.Radius.ui_points(3.0))
+    owners = ["" if image.source is None else f" of S{image.source + 1}" for image in images]
+    labels = [f"mirror image{owner}" for owner in owners]
+    dots = rr.Points3D(
+        at, colors=[GREY], radii=rr.Radius.ui_points(3.0), labels=labels, show_labels=False
+    )
     stream.log("/world/result/mirror_images", dots, static=True)
-    owners = [None if image.source is None else sources.sources[image.source] for image in images]
-    lines = [
-        np.array([place, [source.x_m, source.y_m, 4.0 * LINE_Z]])
-        for place, source in zip(at, owners, strict=True)
-        if source is not None
-    ]
-    if lines:
-        strips = rr.LineStrips3D(lines, colors=[GREY], radii=rr.Radius.ui_points(0.7))
-        stream.log("/world/result/mirror_lines", strips, static=True)
 
 
 def _change_colour(kind: ChangeKind) -> tuple[int, int, int]:

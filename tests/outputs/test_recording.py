@@ -243,12 +243,14 @@ def test_what_a_fit_tells_is_drawn(tmp_path):
     assert reach == pytest.approx(np.sqrt(5.991) * np.array([0.12, 0.05]), rel=0.02)
     images = np.array(recorded.values("/world/result/mirror_images", "positions")[0])
     assert images[:, :2] == pytest.approx(np.array([[3.1, -0.4], [9.0, 9.0]]))
-    assert len(recorded.values("/world/result/mirror_lines", "strips")[0]) == 1
+    owners = recorded.values("/world/result/mirror_images", "labels")[0]
+    assert owners == ["mirror image of S1", "mirror image"]
 
 
 def test_the_summary_tells_sources_and_losses(run):
     text = run_markdown(run)
-    assert "| S2 | 5.73 | 3.38 | -70.0 | 17 | |" in text.replace("  |", " |")
+    assert "| S2 | 5.73 | 3.38 | -70.0 | 17 |\n" in text
+    assert "| 17 | not seen by laser, unsteady |" in run_markdown(fitted_run())
     assert "1294 x odometry pose is not finite" in text
     assert "level [dB re (full scale)²]" in text
     assert "Nothing." in run_markdown(unlucky_run())
