@@ -51,7 +51,6 @@ def nearness_grid(points_m: FloatArray, centre_m: FloatArray) -> NearnessGrid:
     square = offset[:, None] ** 2 + offset[None, :] ** 2
     stamp = np.rint(255 * np.exp(-0.5 * square / SIGMA_M**2)).astype(np.uint8)
     cell = np.floor((points_m - low) / CELL_M).astype(np.int64)
-    cell = np.unique(cell, axis=0)
     base = np.zeros((int(side[1]), int(side[0])), dtype=np.uint8)
     _stamp(base, np.ascontiguousarray(cell), stamp)
     return NearnessGrid(_pooled(base, LEVELS), (float(low[0]), float(low[1])))
@@ -144,6 +143,8 @@ def _stamp(base: ByteArray, cells: NDArray[np.int64], stamp: ByteArray) -> None:
         column, row = cells[k]
         if not (-reach <= column < columns + reach and -reach <= row < rows + reach):
             continue
+        if 0 <= row < rows and 0 <= column < columns and base[row, column] == 255:
+            continue  # stamped before
         for a in range(max(row - reach, 0), min(row + reach + 1, rows)):
             for b in range(max(column - reach, 0), min(column + reach + 1, columns)):
                 value = stamp[a - row + reach, b - column + reach]

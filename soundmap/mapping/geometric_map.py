@@ -27,10 +27,10 @@ from soundmap.mapping.relaxation import relaxed_poses
 from soundmap.odometry_model import OdometryModel, fitted_odometry
 from soundmap.sensors import LaserScan
 
-LOOP_EVERY_M = 0.5
+LOOP_EVERY_M = 1.0
 """Way between two searches for loops."""
-FIRST_GATES_M = (0.4, 0.3, 0.2)
-LAST_GATES_M = (0.25, 0.2, 0.15, 0.12, 0.12, 0.10, 0.10, 0.10)
+FIRST_GATES_M, FIRST_FINE_ROUNDS = (0.4, 0.3, 0.2), 1
+LAST_GATES_M, LAST_FINE_ROUNDS = (0.25, 0.2, 0.15, 0.12, 0.12, 0.10), 3
 FIRST_LEARNT_M = 8.0
 """Way after which the errors of the odometry are learnt; then each time it has grown by half."""
 RARE_NS = 200_000_000
@@ -136,7 +136,7 @@ def build_map(
     )
     graph = GrowingGraph(keys.scans, model, config.neighbours)
     search = _grown(graph, config, report)
-    pose, _ = _relaxed(keys.scans, graph.pose, model, config, FIRST_GATES_M)
+    pose, _ = _relaxed(keys.scans, graph.pose, model, config, FIRST_GATES_M, FIRST_FINE_ROUNDS)
     graph.replace_poses(pose)
     search += _searched_again(graph, config)
     model = _fitted_model(keys.scans, graph.pose, model)
@@ -146,7 +146,8 @@ def build_map(
         model,
         config,
         LAST_GATES_M,
-        lambda done: report(GROWING + RELAXING * done / len(LAST_GATES_M)),
+        LAST_FINE_ROUNDS,
+        lambda done: report(GROWING + RELAXING * done),
     )
     losses.add(
         "laser scan that fits none of its neighbours",
@@ -204,7 +205,7 @@ def _searched_again(graph: GrowingGraph, config: MappingConfig) -> LoopSearch:
     """Loops that were missed on the way, now that the poses are better."""
     search, searched_m = LoopSearch(), -np.inf
     for scan in range(len(graph.scans)):
-        if graph.scans[scan].driven_m - searched_m < 2.0 * LOOP_EVERY_M:
+        if graph.scans[scan].driven_m - searched_m < LOOP_EVERY_M:
             continue
         searched_m = graph.scans[scan].driven_m
         distance = graph.distances_from(scan)
@@ -220,7 +221,8 @@ def _relaxed(
     model: OdometryModel,
     config: MappingConfig,
     gates_m: Sequence[float],
-    report: Callable[[int], None] = lambda _: None,
+    fine_rounds: int,
+    report: Callable[[float], None] = lambda _: None,
 ) -> tuple[FloatArray, Links]:
     return relaxed_poses(
         scans,
@@ -228,6 +230,7 @@ def _relaxed(
         odometry_links(scans, model),
         neighbours=config.neighbours,
         gates_m=gates_m,
+        fine_rounds=fine_rounds,
         report=report,
     )
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from soundmap.geometry import FloatArray, composed, transformed, wrapped_angle
 from soundmap.mapping.alignment import Alignment, PointStore, aligned_scan, pair_fits
 from soundmap.mapping.correlation import NearnessGrid, best_placement, nearness_grid
+from soundmap.mapping.founders import place_key
 from soundmap.mapping.key_scans import KeyScan
 from soundmap.mapping.links import odometry_links, scan_links
 from soundmap.mapping.pose_graph import Links
@@ -24,7 +25,9 @@ REACH_M = 5.0
 """Scans this near are likely to see the same surfaces."""
 CONNECTED_M = 8.0
 """Scans no farther than this in the graph are known well relative to each other."""
-FAR = 1e9
+FARTHEST_M = 200.0
+"""Ways through the graph are followed so far; drift beyond is as great as any."""
+MOST_PIECES = 64
 TURN_M_PER_RAD = 1.0
 """A turn of 1 rad makes scans as different as this distance does."""
 LATEST = 4
@@ -60,6 +63,8 @@ class GrowingGraph:
         self.count = 1
         self.matched = np.zeros(len(scans), dtype=bool)
         self.matched[0] = True
+        self._founders = [0]
+        self._places = {place_key(self._pose[0], scans[0].scanner)}
         self._odometry_links = odometry_links(scans, model)
         self._scan_links: list[Links] = []
         self._trust = np.ones(max(len(scans) - 1, 0))
@@ -91,10 +96,15 @@ class GrowingGraph:
         self._scan_links.append(links)
 
     def distances_from(self, scan: int) -> FloatArray:
-        """Shortest way through the graph from one scan to every scan added [m], shape (count,)."""
+        """Shortest way through the graph from one scan to every scan added [m], shape (count,).
+
+        Infinite where it is longer than `FARTHEST_M`.
+        """
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import dijkstra
 
+        if len(self._scan_links) > MOST_PIECES:
+            self._scan_links = [Links.joined(self._scan_links)]
         pairs = np.concatenate(
             [self._odometry_links.pairs[: self.count - 1], *(x.pairs for x in self._scan_links)]
         )
@@ -108,7 +118,7 @@ class GrowingGraph:
         graph = coo_array(
             (length[once], (pairs[once, 0], pairs[once, 1])), shape=(self.count, self.count)
         )
-        return dijkstra(graph.tocsr(), directed=False, indices=scan)
+        return dijkstra(graph.tocsr(), directed=False, indices=scan, limit=FARTHEST_M)
 
     def add_next(self, distance: FloatArray) -> None:
         """Add the next scan; ``distance`` as from `distances_from` its predecessor."""
@@ -119,19 +129,25 @@ class GrowingGraph:
         self._pose[new] = expected
         self.count += 1
         links = self._laid_on(new, targets, expected, step.information[new - 1])
+        place = place_key(self._pose[new], self.scans[new].scanner)
+        if place not in self._places:
+            self._places.add(place)
+            self._founders.append(new)
         if links is not None:
             self.matched[new] = True
             self._scan_links.append(links)
 
     def _targets(self, expected: FloatArray, distance: FloatArray) -> NDArray[np.int64]:
-        """Well-known scans near a pose: some of the latest, and the most alike."""
+        """Well-known scans near a pose: some of the latest, and the founders most alike."""
         pose = self.pose
         gap = np.hypot(pose[:, 0] - expected[0], pose[:, 1] - expected[1])
-        near = np.flatnonzero((gap < REACH_M) & (distance < CONNECTED_M))
-        turn = np.abs(wrapped_angle(pose[near, 2] - expected[2]))
-        unlike = gap[near] + TURN_M_PER_RAD * turn
-        alike = near[np.argsort(unlike, kind="stable")]
-        latest = near[-LATEST:]
+        near = (gap < REACH_M) & (distance < CONNECTED_M)
+        latest = np.flatnonzero(near)[-LATEST:]
+        founding = np.array(self._founders, dtype=np.int64)
+        founding = founding[near[founding]]
+        turn = np.abs(wrapped_angle(pose[founding, 2] - expected[2]))
+        unlike = gap[founding] + TURN_M_PER_RAD * turn
+        alike = founding[np.argsort(unlike, kind="stable")]
         rest = alike[~np.isin(alike, latest)][: max(self._neighbours - LATEST, 0)]
         return np.concatenate([latest, rest])
 

@@ -7,19 +7,20 @@ stay in one place of its frame wherever it drives, and are removed.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from soundmap.deskew import Rays, deskewed_rays
+from soundmap.deskew import Rays, deskewed_rays, interpolated_pose
 from soundmap.errors import NothingUsableError
-from soundmap.geometry import FloatArray, Trajectory, relative, wrapped_angle
+from soundmap.geometry import FloatArray, Trajectory, wrapped_angle
 from soundmap.losses import LossLedger
 from soundmap.mapping.surface_normals import surface_normals
 from soundmap.sensors import LaserScan
-from soundmap.standstill import StandstillWitness
+from soundmap.standstill import StandstillWitness, compared_ranges, has_moved
 
 STAGE = "map"
 LEAST_RAYS = 20
@@ -34,6 +35,10 @@ BODY_LEAST_SCANS = 20
 BODY_LEAST_WAY_M = 2.0
 """... were taken over at least this way."""
 STRIP_M = 0.25
+STICKS = 0.2
+"""Odometry may stick that has moved less than this share of the way to the next key scan ..."""
+LOOK_NS = 100_000_000
+"""... for this long: then what the scanner sees decides."""
 
 Float32Array = NDArray[np.float32]
 
@@ -136,28 +141,29 @@ def chosen_key_scans(
     steps = np.abs(wrapped_angle(np.diff(odometry.pose[:, 2])))
     turned = np.concatenate([np.zeros(min(len(odometry), 1)), np.cumsum(steps)])
     witness = StandstillWitness(odometry)
-    last: dict[int, FloatArray] = {}
+    last: dict[int, _Place] = {}
     chosen: list[KeyScan] = []
     times: list[int] = []
     for scan in lasers:
         time_ns = scan.middle_ns
-        position = odometry.at(time_ns)
-        if not np.isfinite(position).all():
+        position = interpolated_pose(odometry.time_ns, odometry.pose, time_ns)
+        if math.isnan(position[0]):
             losses.add("laser scan without odometry", STAGE, effect="scan not used")
             continue
         times.append(time_ns)
         witness.see(scan)
-        if not _moved(last.get(scan.scanner), position, distance_m, angle_rad):
+        place = last.get(scan.scanner)
+        if place is not None and not place.has_left(scan, position, distance_m, angle_rad):
             continue
         rays = deskewed_rays(scan, odometry, time_ns)
         if len(rays) < LEAST_RAYS:
             losses.add("laser scan with too few returns", STAGE, effect="scan not used")
             continue
-        last[scan.scanner] = position
+        last[scan.scanner] = _Place(position, time_ns, compared_ranges(scan))
         key = KeyScan(
             time_ns=time_ns,
             scanner=scan.scanner,
-            odometry=position,
+            odometry=np.array(position),
             driven_m=float(np.interp(time_ns, odometry.time_ns, driven)),
             turned_rad=float(np.interp(time_ns, odometry.time_ns, turned)),
             **_thinned(rays, most_returns, spacing_m),
@@ -214,13 +220,30 @@ def _body_cells(scans: list[KeyScan]) -> NDArray[np.int64]:
     return np.unique(core[:, None] + offsets)
 
 
-def _moved(
-    last: FloatArray | None, position: FloatArray, distance_m: float, angle_rad: float
-) -> bool:
-    if last is None:
-        return True
-    step = relative(last, position)
-    return bool(np.hypot(step[0], step[1]) >= distance_m or abs(step[2]) >= angle_rad)
+@dataclass(frozen=True)
+class _Place:
+    """Where a scanner took its last key scan, when, and what it saw there."""
+
+    position: tuple[float, float, float]
+    time_ns: int
+    ranges: FloatArray
+
+    def has_left(
+        self,
+        scan: LaserScan,
+        position: tuple[float, float, float],
+        distance_m: float,
+        angle_rad: float,
+    ) -> bool:
+        """Whether a scan was taken from elsewhere; odometry that sticks does not hide it."""
+        x, y, heading = (now - then for now, then in zip(position, self.position, strict=True))
+        way_m, turn_rad = math.hypot(x, y), abs(math.remainder(heading, 2.0 * math.pi))
+        if way_m >= distance_m or turn_rad >= angle_rad:
+            return True
+        at_rest = way_m < STICKS * distance_m and turn_rad < STICKS * angle_rad
+        if not at_rest or scan.middle_ns - self.time_ns < LOOK_NS:
+            return False
+        return has_moved(self.ranges, compared_ranges(scan))
 
 
 def _thinned(rays: Rays, most: int, spacing_m: float) -> dict[str, Float32Array]:

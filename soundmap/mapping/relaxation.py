@@ -14,22 +14,28 @@ from numpy.typing import NDArray
 
 from soundmap.geometry import FloatArray, wrapped_angle
 from soundmap.mapping.alignment import PairFits, PointStore, pair_fits
+from soundmap.mapping.founders import founders
 from soundmap.mapping.key_scans import KeyScan
 from soundmap.mapping.links import scan_links
 from soundmap.mapping.pose_graph import Links, solved_graph
 
 REACH_M = 5.0
+LATEST = 2
 TURN_M_PER_RAD = 1.0
 LEAST_MATCHED = 20
 LEAST_SHARE = 0.25
 """Scans overlap if this share of the smaller one's returns meets the other's surfaces."""
 ROBUST_SCALE = 4.0
-FINE_ROUNDS = 3
-"""The last rounds use all returns, those before every other one."""
+NEAR_M, SETTLED_M = 0.003, 0.0005
+"""Poses are nearly where they belong, or there, if hardly any moves farther in a round [m]."""
 
 
-def overlapping_pairs(pose: FloatArray, neighbours: int) -> NDArray[np.int64]:
-    """Pairs of poses near each other: the most alike, and as many spread over the rest.
+def overlapping_pairs(
+    pose: FloatArray, scanner: NDArray[np.int64], neighbours: int
+) -> NDArray[np.int64]:
+    """Pairs of poses near each other: with the founders most alike, and as many spread over others.
+
+    Every pose is paired with the `LATEST` before it as well.
 
     Returns
     -------
@@ -38,10 +44,11 @@ def overlapping_pairs(pose: FloatArray, neighbours: int) -> NDArray[np.int64]:
     """
     from scipy.spatial import cKDTree
 
-    tree = cKDTree(pose[:, :2])
-    pairs = set()
-    for k, near in enumerate(tree.query_ball_point(pose[:, :2], REACH_M)):
-        others = np.array(near, dtype=np.int64)
+    founding = founders(pose, scanner)
+    near = cKDTree(pose[founding, :2]).query_ball_point(pose[:, :2], REACH_M)
+    pairs = {(k, k - back) for back in range(1, LATEST + 1) for k in range(back, len(pose))}
+    for k, members in enumerate(near):
+        others = founding[members]
         others = others[others != k]
         gap = np.hypot(*(pose[others, :2] - pose[k, :2]).T)
         turn = np.abs(wrapped_angle(pose[others, 2] - pose[k, 2]))
@@ -49,9 +56,11 @@ def overlapping_pairs(pose: FloatArray, neighbours: int) -> NDArray[np.int64]:
         first, rest = alike[: neighbours // 2], alike[neighbours // 2 :]
         wanted = neighbours - len(first)
         spread = rest[np.linspace(0, len(rest) - 1, min(wanted, len(rest))).astype(np.int64)]
-        for other in (*first, *spread):
-            pairs.add((max(k, int(other)), min(k, int(other))))
-    return np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
+        pairs.update((max(k, other), min(k, other)) for other in first.tolist())
+        pairs.update((max(k, other), min(k, other)) for other in spread.tolist())
+    listed = np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
+    apart = np.hypot(*(pose[listed[:, 0], :2] - pose[listed[:, 1], :2]).T)
+    return listed[apart <= REACH_M]
 
 
 def relaxed_poses(
@@ -61,7 +70,8 @@ def relaxed_poses(
     *,
     neighbours: int,
     gates_m: Sequence[float],
-    report: Callable[[int], None] = lambda _: None,
+    fine_rounds: int,
+    report: Callable[[float], None] = lambda _: None,
 ) -> tuple[FloatArray, Links]:
     """Poses at which all scans fit one another best, and the links of the last round.
 
@@ -75,27 +85,40 @@ def relaxed_poses(
     neighbours : int
         Scans that each one is laid on, at least.
     gates_m : sequence of float
-        Gate of each round [m].
+        Gate of each round, wide to narrow [m]; every other return is used.
+    fine_rounds : int
+        Rounds with all returns and the last gate, at most.
     report : callable
-        Told the number of rounds done.
+        Told the share of the rounds that is done.
     """
     store = PointStore.of(scans)
     size = np.diff(store.first)
-    links = odometry
-    for number, gate in enumerate(gates_m):
-        if number % 3 == 0:
-            pairs = overlapping_pairs(pose, neighbours)
+    scanner = np.array([scan.scanner for scan in scans], dtype=np.int64)
+    links, pairs = odometry, overlapping_pairs(pose, scanner, neighbours)
+    rounds = [*((gate, 2) for gate in gates_m[:-1]), *[(gates_m[-1], 1)] * fine_rounds]
+    number = done = 0
+    while number < len(rounds):
+        gate, stride = rounds[number]
+        if done and done % 3 == 0:
+            pairs = overlapping_pairs(pose, scanner, neighbours)
         if len(pairs) == 0:
             return pose, odometry
         both = np.concatenate([pairs, pairs[:, ::-1]])
-        coarse = number < len(gates_m) - FINE_ROUNDS
-        fits = pair_fits(store, pose, both, gate_m=gate, stride=2 if coarse else 1)
+        fits = pair_fits(store, pose, both, gate_m=gate, stride=stride)
         enough = np.maximum(LEAST_MATCHED, LEAST_SHARE * size[both].min(axis=1))
         overlap = fits.matched >= enough
         kept = PairFits(fits.information[overlap], fits.gradient[overlap], fits.matched[overlap])
         surfaces = scan_links(pose, both[overlap], kept, least_matched=LEAST_MATCHED)
         links = Links.joined([odometry, surfaces])
         # The pairs are fitted anew after every step: more steps with the old fits gain nothing.
-        pose = solved_graph(pose, links, most_iterations=1, robust_scale=ROBUST_SCALE).pose
-        report(number + 1)
+        solution = solved_graph(pose, links, most_iterations=1, robust_scale=ROBUST_SCALE)
+        step_m = float(np.quantile(np.hypot(*(solution.pose - pose)[:, :2].T), 0.95))
+        pose, done = solution.pose, done + 1
+        fine = number >= len(gates_m) - 1
+        if fine and step_m < SETTLED_M:
+            break
+        # Poses that hardly move need no wide gate.
+        number = len(gates_m) - 1 if not fine and step_m < NEAR_M else number + 1
+        report(number / len(rounds))
+    report(1.0)
     return pose, links

@@ -46,7 +46,7 @@ def round_the_block(walls, **error):
            (middle, SHORT - middle), (middle, middle), (middle + 4, middle)]  # fmt: skip
     truth = worlds.driven(way, speed=1.0)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(worlds, "segments", lambda: walls)
+        patch.setattr(worlds, "segments", lambda _: walls)
         scans = worlds.laser_scans(truth, [worlds.FRONT], rate_hz=4, beams=181)
     short_sighted = [
         replace(scan, range_m=np.where(scan.range_m < 6.0, scan.range_m, np.nan))

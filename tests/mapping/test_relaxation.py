@@ -1,6 +1,7 @@
 import numpy as np
 
 from soundmap.geometry import composed
+from soundmap.mapping.founders import founders
 from soundmap.mapping.links import odometry_links
 from soundmap.mapping.pose_graph import link_costs
 from soundmap.mapping.relaxation import overlapping_pairs, relaxed_poses
@@ -26,7 +27,7 @@ def test_scattered_scans_fall_into_place():
     start[0] = true[0]
     odometry = odometry_links(scans, MODEL)
     found, links = relaxed_poses(
-        scans, start, odometry, neighbours=14, gates_m=(0.3, 0.2, 0.15, 0.1, 0.1)
+        scans, start, odometry, neighbours=14, gates_m=(0.3, 0.2, 0.15, 0.1), fine_rounds=2
     )
     before = drives.errors(start, true)
     after = drives.errors(found, true)
@@ -42,25 +43,32 @@ def test_scans_that_share_no_surface_keep_to_their_odometry():
     far = [scans[0], scans[-1]]
     odometry = odometry_links(far, MODEL)
     start = np.array([true[0], true[-1] + [50.0, 0.0, 0.0]])
-    found, links = relaxed_poses(far, start, odometry, neighbours=4, gates_m=(0.2,))
+    found, links = relaxed_poses(far, start, odometry, neighbours=4, gates_m=(0.2,), fine_rounds=1)
     np.testing.assert_array_equal(found, start)
     assert len(links) == 1
 
 
-def test_every_pose_is_paired_with_enough_near_ones_and_none_twice():
+def test_every_pose_is_paired_with_enough_founders_near_it_and_none_twice():
     rng = np.random.default_rng(1)
-    pose = np.column_stack([rng.uniform(0, 10, (80, 2)), rng.uniform(-3, 3, 80)])
-    pairs = overlapping_pairs(pose, 10)
+    pose = np.column_stack([rng.uniform(0, 10, (200, 2)), rng.uniform(-3, 3, 200)])
+    scanner = np.zeros(200, dtype=np.int64)
+    pairs = overlapping_pairs(pose, scanner, 10)
     assert len(np.unique(pairs, axis=0)) == len(pairs)
     assert np.all(pairs[:, 0] > pairs[:, 1])
     gap = np.hypot(*(pose[pairs[:, 0], :2] - pose[pairs[:, 1], :2]).T)
     assert gap.max() <= 5.0
-    distance = np.hypot(*(pose[:, None, :2] - pose[None, :, :2]).transpose(2, 0, 1))
-    near = (distance <= 5.0).sum(axis=1) - 1
-    count = np.bincount(pairs.ravel(), minlength=80)
+    founding = founders(pose, scanner)
+    distance = np.hypot(*(pose[:, None, :2] - pose[None, founding, :2]).transpose(2, 0, 1))
+    near = (distance <= 5.0).sum(axis=1) - np.isin(np.arange(200), founding)
+    count = np.bincount(pairs.ravel(), minlength=200)
     assert np.all(count >= np.minimum(near, 10))
 
 
 def test_the_pairs_do_not_grow_with_the_visits_to_a_place():
     pose = np.zeros((300, 3))
-    assert len(overlapping_pairs(pose, 10)) <= 300 * 10
+    assert len(overlapping_pairs(pose, np.zeros(300, dtype=np.int64), 10)) <= 300 * 3
+
+
+def test_a_place_has_one_founder_a_scanner_and_direction():
+    pose = np.array([[0.1, 0.1, 0.1], [0.2, 0.2, 0.2], [0.1, 0.1, 2.0], [0.1, 0.1, 0.1], [2, 0, 0]])
+    assert founders(pose, np.array([0, 0, 0, 1, 0])).tolist() == [0, 2, 3, 4]
