@@ -17,7 +17,7 @@ from soundmap.detect.difference import (
     power_ratio,
     seen_from_the_other_side,
 )
-from soundmap.detect.place_levels import PlaceLevels, place_levels
+from soundmap.detect.place_levels import PlaceLevels, images_apart, place_levels
 from soundmap.detect.source_changes import matched_sources, paired_places, source_changes
 from soundmap.errors import OutputError
 from soundmap.geometry import FloatArray
@@ -29,8 +29,6 @@ from soundmap.run import Run
 from soundmap.sensors import MicArray
 from soundmap.sound import PowerMap
 
-APART_M = 0.25
-"""Mirror images nearer than this to a source or to each other are not told from it."""
 STAGE = "diff"
 
 
@@ -111,10 +109,7 @@ def compared(run: Path, background: Path, diff: DiffConfig, detect: DetectConfig
 def _changes_of_sources(run: Run, background: Run, diff: DiffConfig) -> tuple[Change, ...]:
     pairs = matched_sources(run.sources, background.sources)
     here_m, there_m = paired_places(pairs, run.sources, background.sources)
-    every = [
-        (image.x_m, image.y_m) for each in (run, background) for image in each.sources.reflections
-    ]
-    images_m = _apart(np.array(every).reshape(-1, 2), here_m)
+    images_m = images_apart([run.sources, background.sources], here_m)
     visits = [
         run.sources.sources[i].visits if i is not None else _visits(run.power_map, place_m)
         for (i, _), place_m in zip(pairs, here_m, strict=True)
@@ -182,16 +177,6 @@ def _ordered(changes: tuple[Change, ...]) -> tuple[Change, ...]:
         return 2 + (change.kind == ChangeKind.UNTOLD), -change.ratio_db
 
     return tuple(sorted(changes, key=rank))
-
-
-def _apart(images_m: FloatArray, places_m: FloatArray) -> FloatArray:
-    """Images that are near neither a place nor an image before them."""
-    kept = np.zeros((0, 2))
-    for image in images_m:
-        others = np.concatenate([places_m, kept])
-        if not len(others) or np.hypot(*(others - image).T).min() > APART_M:
-            kept = np.concatenate([kept, image[None]])
-    return kept
 
 
 def _visits(power_map: PowerMap, place_m: FloatArray) -> int:

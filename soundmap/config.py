@@ -294,6 +294,20 @@ def loaded_config(paths: Iterable[Path]) -> Config:
         raise ConfigError(_faults(error, " + ".join(names))) from None
 
 
+def stored_config(path: Path) -> Config:
+    """Configuration of a finished run; keys that this soundmap does not know are left out.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be read, is not TOML, or holds impossible values.
+    """
+    try:
+        return Config.model_validate(_known(_read_toml(path), Config))
+    except ValidationError as error:
+        raise ConfigError(_faults(error, str(path))) from None
+
+
 def config_toml(config: Config) -> str:
     """The configuration as TOML, valid as input; what is None is left out."""
     return tomli_w.dumps(config.model_dump(mode="json", exclude_none=True))
@@ -352,6 +366,19 @@ def _unknown_keys(
         inner = field.annotation
         if isinstance(inner, type) and issubclass(inner, BaseModel) and isinstance(value, dict):
             yield from _unknown_keys(value, inner, (*where, key))
+
+
+def _known(table: Mapping[str, Any], model: type[BaseModel]) -> dict[str, Any]:
+    """The keys that a model knows, and of inner tables those that theirs do."""
+    known = {}
+    for key, value in table.items():
+        field = model.model_fields.get(key)
+        inner = None if field is None else field.annotation
+        if isinstance(inner, type) and issubclass(inner, BaseModel) and isinstance(value, dict):
+            known[key] = _known(value, inner)
+        elif field is not None:
+            known[key] = value
+    return known
 
 
 def _faults(error: ValidationError, file: str) -> str:

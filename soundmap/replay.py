@@ -10,6 +10,7 @@ from typing import Protocol, TypeVar
 
 from soundmap.config import Config, ScanConfig
 from soundmap.detect.fitted_sources import fitted_sources
+from soundmap.detect.place_levels import with_level_errors
 from soundmap.detect.source_list import detect_sources
 from soundmap.errors import ConfigError, NothingUsableError
 from soundmap.fuse.accumulate import PowerAccumulator
@@ -108,6 +109,7 @@ def process(
             sources = fitted_sources(
                 scans, around, trajectory, array, config.scan, config.detect, room=room
             )
+            sources = with_level_errors(sources, scans, trajectory, array, room, config.scan)
         else:
             sources = detect_sources(power_map, config.detect)
     return Run(

@@ -220,6 +220,8 @@ class SourceFit:
         Width of the arc of directions that it was heard from [rad].
     flags : tuple of str
         ``not_seen_by_laser``, ``seen_from_one_side``, ``unsteady``.
+    level_sigma_db : float or None
+        Standard error of the level, from how it scatters along the way [dB]; None if unknown.
     """
 
     power_1m: float
@@ -227,6 +229,7 @@ class SourceFit:
     false_alarm_probability: float
     arc_rad: float
     flags: tuple[str, ...]
+    level_sigma_db: float | None = None
 
 
 @dataclass(frozen=True)

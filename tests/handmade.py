@@ -99,7 +99,7 @@ def fitted_run(log: Path = Path("logs/run1.mcap")) -> Run:
     """A run whose sources come from a fit: one is sure, the other is not; with mirror images."""
     run = made_run(log)
     sure, doubtful = run.sources.sources
-    near = SourceFit(sure.power, np.diag([0.02**2, 0.02**2]), 1e-12, 2.0, ())
+    near = SourceFit(sure.power, np.diag([0.02**2, 0.02**2]), 1e-12, 2.0, (), 0.3)
     flags = ("not_seen_by_laser", "unsteady")
     far = SourceFit(doubtful.power, np.diag([0.12**2, 0.05**2]), 0.004, 0.5, flags)
     images = (Reflection(3.1, -0.4, 1e-8, 0), Reflection(9.0, 9.0, 5e-9, None))

@@ -13,6 +13,8 @@ out negative: a place that is silent scatters round 0.
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +26,7 @@ from soundmap.geometry import FloatArray, Mount, Trajectory, transformed
 from soundmap.grid import OccupancyGrid
 from soundmap.raycast import cast_ranges
 from soundmap.sensors import MicArray
-from soundmap.sound import AudioScans
+from soundmap.sound import AudioScans, SourceList
 
 HEIGHT_M, NEAREST_M = 0.3, 0.4
 """Height between source and array, and least distance, that are assumed [m]."""
@@ -37,6 +39,9 @@ LEAST_FREEDOM = 1.0
 """Degrees of freedom below which a run does not tell of a place."""
 SLOPE_DB_PER_OCTAVE = -6.0
 """Of the sound's spectrum over the band: only the width of the beams depends on it, a little."""
+APART_M = 0.25
+"""Mirror images nearer than this to a source or to each other are not told from it."""
+DECIBELS_PER_SHARE = 10.0 / np.log(10.0)
 WAVES = 360
 CHUNK = 2000
 
@@ -111,6 +116,47 @@ def place_levels(
         np.where(known, sigma[:count], np.nan),
         np.where(known, freedom[:count], 0.0),
     )
+
+
+def with_level_errors(
+    sources: SourceList,
+    scans: AudioScans,
+    trajectory: Trajectory,
+    array: MicArray,
+    room: OccupancyGrid,
+    config: ScanConfig,
+) -> SourceList:
+    """The same sources, each with the standard error of its level where the run tells of it.
+
+    Parameters
+    ----------
+    sources : SourceList
+        Of a fit.
+    scans, trajectory, array, room, config
+        As for `place_levels`.
+    """
+    places = np.array([(source.x_m, source.y_m) for source in sources]).reshape(-1, 2)
+    images = images_apart([sources], places)
+    levels = place_levels(places, scans, trajectory, array, room, config, images_m=images)
+    told = []
+    for source, power, sigma in zip(sources, levels.power_1m, levels.sigma, strict=True):
+        fit = source.fit
+        if fit is not None and power > sigma:
+            error = DECIBELS_PER_SHARE * float(sigma / power)
+            fit = dataclasses.replace(fit, level_sigma_db=error)
+        told.append(dataclasses.replace(source, fit=fit))
+    return dataclasses.replace(sources, sources=tuple(told))
+
+
+def images_apart(lists: Iterable[SourceList], places_m: FloatArray) -> FloatArray:
+    """Mirror images that are near neither a place nor an image before them, shape (I, 2)."""
+    kept = np.zeros((0, 2))
+    for image in (image for sources in lists for image in sources.reflections):
+        here = np.array([image.x_m, image.y_m])
+        others = np.concatenate([places_m, kept])
+        if not len(others) or np.hypot(*(others - here).T).min() > APART_M:
+            kept = np.concatenate([kept, here[None]])
+    return kept
 
 
 def _stretches(trajectory: Trajectory, time_ns: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -26,8 +26,8 @@ from soundmap.sound import Source, SourceList, decibels
 SCHEMA_VERSION = 1
 SOURCE_COLUMNS = (
     "id", "x_m", "y_m", "power_db", "visits", "power_reference",
-    "level_1m_db", "var_x_m2", "cov_xy_m2", "var_y_m2", "false_alarm_probability", "arc_deg",
-    "flags",
+    "level_1m_db", "level_sigma_db", "var_x_m2", "cov_xy_m2", "var_y_m2",
+    "false_alarm_probability", "arc_deg", "flags",
 )  # fmt: skip
 REFLECTION_COLUMNS = ("id", "x_m", "y_m", "level_1m_db", "source")
 CHANGE_COLUMNS = (
@@ -131,6 +131,7 @@ def _fit_row(source: Source) -> dict[str, Any]:
     (var_x, cov_xy), (_, var_y) = fit.covariance_m2.tolist()
     return {
         "level_1m_db": _finite(round(float(decibels(fit.power_1m)), 3)),
+        "level_sigma_db": None if fit.level_sigma_db is None else round(fit.level_sigma_db, 3),
         "var_x_m2": round(var_x, 7),
         "cov_xy_m2": round(cov_xy, 7),
         "var_y_m2": round(var_y, 7),

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soundmap.change import Change, ChangeKind, PowerRatio
-from soundmap.config import loaded_config
+from soundmap.config import stored_config
 from soundmap.errors import LogError
 from soundmap.geometry import Mount, Trajectory
 from soundmap.grid import GridFrame, OccupancyGrid
@@ -75,7 +75,7 @@ def read_run(folder: Path) -> Run:
         return Run(
             log=Path(report["log_path"]),
             fingerprint=report["fingerprint"],
-            config=loaded_config([folder / "config.toml"]),
+            config=stored_config(folder / "config.toml"),
             room=read_map(folder / "map.yaml"),
             trajectory=trajectory,
             scans=scans,
@@ -260,6 +260,7 @@ def _fit(row: Mapping[str, Any]) -> SourceFit | None:
         float(row["false_alarm_probability"]),
         math.radians(row["arc_deg"]),
         tuple(row["flags"].split()),
+        row.get("level_sigma_db"),
     )
 
 

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from soundmap.config import ScanConfig
-from soundmap.detect.place_levels import place_levels
+from soundmap.detect.place_levels import place_levels, with_level_errors
 from soundmap.geometry import Mount, Trajectory
 from soundmap.grid import OccupancyGrid
 from soundmap.sensors import MicArray
+from soundmap.sound import LevelReference, Reflection, Source, SourceFit, SourceList
 from tests.handmade import walled_room
 from tests.heard import circle, drive, heard_scans
 
@@ -95,3 +96,20 @@ def test_without_scans_or_places_there_are_no_levels():
     lost = replace(WAY, usable=np.zeros(len(WAY), dtype=bool))
     assert np.isnan(levels(PLACES, scans, way=lost).power_1m).all()
     assert len(levels(NONE, scans).power_1m) == 0
+
+
+def test_sources_get_the_error_of_their_level():
+    fit = SourceFit(1e-7, np.eye(2), 0.0, 1.0, ())
+    sources = SourceList(
+        tuple(Source(x, y, power, 9, fit) for x, y, power in SOURCES),
+        LevelReference.FULL_SCALE,
+        (Reflection(2.5, 0.35, 1e-8, 0),),
+    )
+    scans = heard_scans(WAY, SOURCES, seed=7)
+    told = with_level_errors(sources, scans, WAY, ARRAY, ROOM, ScanConfig())
+    expected = levels(PLACES, scans)  # the image is too near to its source to be told from it
+    sigma_db = 10 / np.log(10) * expected.sigma / expected.power_1m
+    assert [source.fit.level_sigma_db for source in told] == pytest.approx(sigma_db)
+    assert [source.power for source in told] == [source.power for source in sources]
+    nobody = SourceList((), LevelReference.FULL_SCALE)
+    assert with_level_errors(nobody, scans, WAY, ARRAY, ROOM, ScanConfig()) == nobody

@@ -237,7 +237,7 @@ def test_what_a_fit_tells_is_drawn(tmp_path):
         pass
     recorded = Recorded(tmp_path / "run.rrd")
     labels = recorded.values("/world/result/source_labels", "labels")[0]
-    assert labels == ["S1  -64.0 dB", "S2  -70.0 dB (not seen by laser, unsteady)"]
+    assert labels == ["S1  -64.0 ± 0.3 dB", "S2  -70.0 dB (not seen by laser, unsteady)"]
     ellipse = np.array(recorded.values("/world/result/source_ellipses", "strips")[0][1])
     reach = np.abs(ellipse[:, :2] - ellipse[:-1, :2].mean(axis=0)).max(axis=0)
     assert reach == pytest.approx(np.sqrt(5.991) * np.array([0.12, 0.05]), rel=0.02)

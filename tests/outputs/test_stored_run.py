@@ -102,12 +102,21 @@ def test_a_difference_of_an_earlier_soundmap_still_reads(tmp_path):
     assert {change.false_alarm_probability for change in changes} == {None}
 
 
+def test_settings_that_are_no_longer_known_do_not_keep_a_run_from_being_read(tmp_path):
+    write_run(made_run(), tmp_path, figures=PictureFormat.NONE)
+    file = tmp_path / "config.toml"
+    text = file.read_text()
+    file.write_text(text.replace("[scan]", "[once]\nkey = 1\n\n[scan]\nformer = true"))
+    assert read_run(tmp_path).config == made_run().config
+
+
 def test_what_a_fit_found_reads_back_as_it_was(tmp_path):
     run = fitted_run()
     write_run(run, tmp_path, figures=PictureFormat.NONE)
     read = read_run(tmp_path).sources
     for found, made in zip(read, run.sources, strict=True):
         assert found.fit.flags == made.fit.flags
+        assert found.fit.level_sigma_db == made.fit.level_sigma_db
         np.testing.assert_allclose(found.fit.covariance_m2, made.fit.covariance_m2)
         assert found.fit.power_1m == pytest.approx(made.fit.power_1m, rel=1e-3)
         assert found.fit.false_alarm_probability == made.fit.false_alarm_probability

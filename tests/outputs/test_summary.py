@@ -37,7 +37,7 @@ def test_the_summary_of_a_run_names_everything_a_person_asks_for():
 def test_the_summary_tells_errors_and_remarks_where_a_fit_knows_them():
     text = run_text(fitted_run())
     rows = [line.split() for line in text.splitlines() if line.strip().startswith("S")]
-    assert ["S1", "3.125", "0.275", "5", "x", "5", "-64.0", "22"] in rows
+    assert ["S1", "3.125", "0.275", "5", "x", "5", "-64.0", "±", "0.3", "22"] in rows
     assert rows[1][:8] == ["S2", "5.725", "3.375", "29", "x", "12", "-70.0", "17"]
     assert "not seen by laser" in " ".join(text.split())
     assert max(len(line) for line in text.splitlines()) <= 80
