@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import struct
+from bisect import bisect_left
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -72,6 +73,26 @@ class Message(NamedTuple):
     data: memoryview
 
 
+class Batch(NamedTuple):
+    """Some messages that lie together, in the order of log time.
+
+    ``first_ns`` and ``last_ns`` are the span of the messages of all channels; ``messages`` holds
+    those that are wanted.
+    """
+
+    first_ns: int
+    last_ns: int
+    messages: list[Message]
+
+
+class KnownChunk(NamedTuple):
+    """What a chunk holds, from an earlier pass; no channels if it is damaged."""
+
+    channels: frozenset[Channel]
+    first_ns: int
+    last_ns: int
+
+
 Wanted = Callable[[Channel], bool]
 
 
@@ -100,36 +121,37 @@ class McapLog:
         self.path = path
         self.files = files
         self.losses = losses
-        self._chunk_topics: dict[tuple[int, int], frozenset[Channel]] = {}
-        self._surveyed = False
         for file in files:
             _check_magic(file)
+        # A log that is still being written is read up to where it ends now, in every pass.
+        self.sizes = tuple(file.stat().st_size for file in files)
+        self.known_chunks: dict[tuple[int, int], KnownChunk] = {}
+        self.known_channels: dict[int, dict[int, Channel]] = {}
+        self._surveyed = False
 
     @property
     def size_bytes(self) -> int:
         """Size of all files."""
-        return sum(file.stat().st_size for file in self.files)
+        return sum(self.sizes)
 
     def fingerprint(self) -> str:
         """SHA-256 over the sizes of the files and samples of their content; cheap for any size."""
         digest = hashlib.sha256()
-        for file in self.files:
-            size = file.stat().st_size
+        for file, size in zip(self.files, self.sizes, strict=True):
             digest.update(struct.pack("<Q", size))
             step = max((size - 2**20) // 7, 2**20)
             with file.open("rb") as stream:
-                for offset in range(0, size, step):
+                for offset in [*range(0, size, step), max(size - 2**20, 0)]:
                     stream.seek(offset)
-                    digest.update(stream.read(2**20))
-                stream.seek(max(size - 2**20, 0))
-                digest.update(stream.read(2**20))
+                    digest.update(stream.read(min(2**20, size - offset)))
         return digest.hexdigest()
 
     def messages(self, wanted: Wanted = lambda _: True) -> Iterator[Message]:
         """Messages of the wanted channels in the order of their log time.
 
-        Order is restored inside a chunk and across neighbouring chunks. The order is the same in
-        every pass. The first pass should want everything that later passes will want.
+        Order is restored inside a chunk and across neighbouring chunks. The order of a topic is
+        the same in every pass, whatever else is wanted. The first pass should want everything that
+        later passes will want.
         """
         for number, file in enumerate(self.files):
             yield from _in_order(_FileWalk(self, number, file, wanted).batches())
@@ -140,59 +162,50 @@ class McapLog:
         if not self._surveyed:
             self.losses.add(what, where, effect=effect, count=count)
 
-    def chunk_topics(self, place: tuple[int, int]) -> frozenset[Channel] | None:
-        """Channels in the chunk at (file, offset); empty if damaged, None if not seen yet."""
-        return self._chunk_topics.get(place)
-
-    def remember_chunk(self, place: tuple[int, int], channels: frozenset[Channel]) -> None:
-        """Note what a chunk holds, for later passes."""
-        self._chunk_topics[place] = channels
-
 
 class _FileWalk:
     """One pass over the records of one file."""
 
     def __init__(self, log: McapLog, number: int, file: Path, wanted: Wanted) -> None:
         self.log, self.number, self.file, self.wanted = log, number, file, wanted
-        self.size = file.stat().st_size
+        self.size = log.sizes[number]
         self.schemas: dict[int, Schema] = {}
-        self.channels: dict[int, Channel] = {}
+        # The record of a channel may lie in a chunk that this pass skips.
+        self.channels = dict(log.known_channels.get(number, {}))
         self.selected: dict[int, Channel | None] = {}
         self.summary = FileSummary()
         self.chunked = False
         self.last_ns = 0
         self.messages = 0
 
-    def batches(self) -> Iterator[list[Message]]:
-        """Messages chunk by chunk, each list in the order of log time."""
+    def batches(self) -> Iterator[Batch]:
+        """Messages chunk by chunk."""
+        loose, loose_ns, loose_bytes = list[Message](), list[int](), 0
         with self.file.open("rb", buffering=2**18) as stream:
             self.summary = file_summary(stream, self.size)
-            stream.seek(len(MAGIC))
-            loose: list[Message] = []
-            loose_bytes = 0
             for opcode, offset, length in self._records(stream):
                 if opcode == Opcode.CHUNK:
                     self.chunked = True
-                    if loose:
-                        yield sorted(loose, key=itemgetter(1))
-                        loose, loose_bytes = [], 0
+                    if loose_ns:
+                        yield _batch(loose, loose_ns)
+                        loose, loose_ns, loose_bytes = [], [], 0
                     if batch := self._chunk(stream, offset, length):
-                        self.last_ns = batch[-1].log_time_ns
+                        self.last_ns = batch.last_ns
                         yield batch
                 elif opcode in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
                     if length > MAX_CHUNK_BYTES:
                         self.log.count("record too long", self.file.name, "left out")
                         continue
-                    message = self._record(opcode, memoryview(stream.read(length)))
-                    if message is not None:
-                        loose.append(message)
-                        self.last_ns = message.log_time_ns
-                        loose_bytes += length
-                    if loose_bytes > BATCH_BYTES:
-                        yield sorted(loose, key=itemgetter(1))
-                        loose, loose_bytes = [], 0
-            if loose:
-                yield sorted(loose, key=itemgetter(1))
+                    before = len(loose_ns)
+                    self._record(opcode, memoryview(stream.read(length)), loose, loose_ns)
+                    loose_bytes += length
+                    self.last_ns = loose_ns[-1] if len(loose_ns) > before else self.last_ns
+                    if loose_ns and loose_bytes > BATCH_BYTES:
+                        yield _batch(loose, loose_ns)
+                        loose, loose_ns, loose_bytes = [], [], 0
+            if loose_ns:
+                yield _batch(loose, loose_ns)
+        self.log.known_channels[self.number] = self.channels
         self.log.count(
             "message that the file's own summary counts is missing",
             self.file.name,
@@ -239,24 +252,30 @@ class _FileWalk:
         megabytes = f"{position / 1e6:.1f} of {self.size / 1e6:.1f} MB"
         self.log.count("log ends early", self.file.name, f"read {megabytes}, all that is whole")
 
-    def _record(self, opcode: int, data: memoryview) -> Message | None:
-        """Take in a schema or channel; hand out a message if it is wanted."""
+    def _record(
+        self, opcode: int, data: memoryview, messages: list[Message], times_ns: list[int]
+    ) -> None:
+        """Take in a schema or channel, or add a message: its time, and itself if it is wanted."""
         if opcode == Opcode.MESSAGE:
             if len(data) < _MESSAGE.size:
                 self.log.count("message too short", self.file.name, "left out")
-                return None
+                return
             channel_id, _, log_time, publish_time = _MESSAGE.unpack_from(data)
             self.messages += 1
-            channel = self._selected(channel_id)
-            if channel is None or not self._is_time(log_time):
-                return None
+            if not self._is_time(log_time):
+                return
             # Where there are chunks, a message outside may be something else in disguise.
             if self.chunked and not (
                 is_near(log_time, self.last_ns) and is_near(publish_time, self.last_ns)
             ):
                 self.log.count("message between chunks makes no sense", self.file.name, "left out")
-                return None
-            return Message(channel, log_time, publish_time, data[_MESSAGE.size :])
+                return
+            times_ns.append(log_time)
+            channel = self._selected(channel_id)
+            if channel is not None:
+                content = data[_MESSAGE.size :]
+                messages.append(Message(channel, log_time, publish_time, content))
+            return
         try:
             source = ReadDataStream(BytesIO(data))
             if opcode == Opcode.SCHEMA:
@@ -266,7 +285,6 @@ class _FileWalk:
                 self._add_channel(ChannelRecord.read(source))
         except RECORD_DAMAGE:
             self.log.count("damaged schema or channel record", self.file.name, "left out")
-        return None
 
     def _is_time(self, log_time: int) -> bool:
         if log_time <= LAST_TIME_NS:
@@ -303,35 +321,35 @@ class _FileWalk:
         if channel_id not in self.channels and channel_id in self.summary.channels:
             self._add_channel(self.summary.channels[channel_id])
 
-    def _chunk(self, stream: IO[bytes], offset: int, length: int) -> list[Message]:
-        """The wanted messages of a chunk in the order of log time."""
+    def _chunk(self, stream: IO[bytes], offset: int, length: int) -> Batch | None:
+        """The wanted messages of a chunk; None if it is damaged or empty."""
         place = (self.number, offset)
-        held = self.log.chunk_topics(place)
-        if held is not None and not any(self.wanted(channel) for channel in held):
-            return []
+        known = self.log.known_chunks.get(place)
+        if known is not None and not any(self.wanted(channel) for channel in known.channels):
+            return Batch(known.first_ns, known.last_ns, []) if known.channels else None
         try:
             if length > MAX_CHUNK_BYTES:
                 raise ValueError(f"it is {length / 2**20:.0f} MiB long, more than is credible")
-            # Checksums need no second look in later passes: a damaged chunk holds no topics.
-            data = chunk_content(stream.read(length), check=held is None)
+            # Checksums need no second look in later passes: a damaged chunk holds no channels.
+            data = chunk_content(stream.read(length), check=known is None)
         except RECORD_DAMAGE as error:
             self.log.count("damaged chunk", self.file.name, f"left out ({_reason(error)})")
-            self.log.remember_chunk(place, frozenset())
-            return []
-        messages, seen = self._chunk_messages(memoryview(data))
-        self.log.remember_chunk(place, frozenset(seen))
-        messages.sort(key=itemgetter(1))
-        return messages
+            self.log.known_chunks[place] = KnownChunk(frozenset(), 0, 0)
+            return None
+        messages, times_ns, seen = self._chunk_messages(memoryview(data))
+        if not times_ns or not seen:
+            self.log.known_chunks[place] = KnownChunk(frozenset(), 0, 0)
+            return None
+        batch = _batch(messages, times_ns)
+        self.log.known_chunks[place] = KnownChunk(frozenset(seen), batch.first_ns, batch.last_ns)
+        return batch
 
-    def _chunk_messages(self, data: memoryview) -> tuple[list[Message], set[Channel]]:
-        messages: list[Message] = []
-        ids: set[int] = set()
+    def _chunk_messages(self, data: memoryview) -> tuple[list[Message], list[int], set[Channel]]:
+        """The wanted messages, the times of all, and the channels of all."""
+        messages, times_ns, ids = list[Message](), list[int](), set[int]()
         position, end = 0, len(data)
-        read_head, read_message, head_size = (
-            RECORD_HEAD.unpack_from,
-            _MESSAGE.unpack_from,
-            RECORD_HEAD.size,
-        )
+        read_head, head_size = RECORD_HEAD.unpack_from, RECORD_HEAD.size
+        read_message = _MESSAGE.unpack_from
         while position + head_size <= end:
             opcode, length = read_head(data, position)
             start = position + head_size
@@ -340,37 +358,47 @@ class _FileWalk:
                 self.log.count("record reaches beyond its chunk", self.file.name, "left out")
                 break
             if opcode != 5 or length < 22:
-                self._record(opcode, data[start:position])
+                self._record(opcode, data[start:position], messages, times_ns)
                 continue
             channel_id, _, log_time, publish_time = read_message(data, start)
             ids.add(channel_id)
             self.messages += 1
+            if not self._is_time(log_time):
+                continue
+            times_ns.append(log_time)
             channel = self._selected(channel_id)
-            if channel is not None and self._is_time(log_time):
+            if channel is not None:
                 messages.append(
                     Message(channel, log_time, publish_time, data[start + 22 : position])
                 )
-        return messages, {self.channels[i] for i in ids if i in self.channels}
+        return messages, times_ns, {self.channels[i] for i in ids if i in self.channels}
 
 
 def _reason(error: BaseException) -> str:
     return str(error) or type(error).__name__
 
 
-def _in_order(batches: Iterator[list[Message]]) -> Iterator[Message]:
-    """Merge batches, each in order, over neighbours: one batch is held back."""
+def _batch(messages: list[Message], times_ns: list[int]) -> Batch:
+    return Batch(min(times_ns), max(times_ns), sorted(messages, key=itemgetter(1)))
+
+
+def _in_order(batches: Iterator[Batch]) -> Iterator[Message]:
+    """Merge batches over neighbours: what is not older than the latest but one is held back.
+
+    What goes out when depends on the times of all messages, not only of those wanted, so that the
+    order of a topic is the same in every pass.
+    """
     held: list[Message] = []
+    latest_ns, settled_ns = 0, 0  # of all batches, and of all but the last
     for batch in batches:
-        if held and held[-1].log_time_ns > batch[0].log_time_ns:
-            # Overlapping neighbours. What was held before goes out up to where the new one begins,
-            # and of the rest no more is held than the new batch is long in time.
-            merged = sorted([*held, *batch], key=itemgetter(1))
-            ready = len(merged) - len(batch)
-            yield from merged[:ready]
-            held = merged[ready:]
+        if held and held[-1].log_time_ns > batch.first_ns:
+            held = sorted([*held, *batch.messages], key=itemgetter(1))
         else:
-            yield from held
-            held = batch
+            held = [*held, *batch.messages]
+        ready = bisect_left(held, max(batch.first_ns, settled_ns), key=itemgetter(1))
+        yield from held[:ready]
+        held = held[ready:]
+        settled_ns, latest_ns = latest_ns, max(latest_ns, batch.last_ns)
     yield from held
 
 

@@ -15,7 +15,7 @@ from mcap.writer import CompressionType, IndexType
 
 from soundmap.errors import LogError
 from soundmap.logs.log_files import log_files
-from soundmap.logs.reader import McapLog
+from soundmap.logs.reader import KnownChunk, McapLog
 from soundmap.losses import LossLedger
 
 SHARED = Path(__file__).parents[2] / ".." / "shared" / "data" / "mcap"
@@ -98,6 +98,55 @@ def test_order_is_restored_inside_chunks_and_across_neighbours(tmp_path):
     logged = [m.log_time_ns for m in messages]
     assert logged == sorted(logged)
     assert sorted(numbers(messages)) == list(range(400))
+
+
+@pytest.mark.parametrize("chunking", [True, False])
+@pytest.mark.parametrize("disorder", [3, 30, 400])
+def test_a_topic_has_the_same_order_in_every_pass_however_disordered(tmp_path, chunking, disorder):
+    rng = np.random.default_rng(disorder)
+    with LogWriter(tmp_path / "log.mcap", chunk_size=1000, use_chunking=chunking) as log:
+        for i in range(600):
+            time = START_NS + 10 * (i + int(rng.integers(-disorder, disorder + 1)))
+            payload = struct.pack("<I", i) + bytes(int(rng.integers(40)))
+            log.raw(f"/{'abc'[rng.integers(3)]}", BYTES, "raw", payload, time)
+    messages, _, log = read(tmp_path / "log.mcap")
+    assert len(messages) == 600
+    for topic in ("/a", "/b", "/c"):
+        of_topic = [message for message in messages if message.channel.topic == topic]
+        again = list(log.messages(lambda channel, topic=topic: channel.topic == topic))
+        assert numbers(again) == numbers(of_topic)
+
+
+def test_a_channel_told_in_a_chunk_without_its_messages_is_known_in_later_passes(tmp_path):
+    with LogWriter(tmp_path / "log.mcap", chunk_size=1000, repeat_channels=False) as log:
+        log.raw("/late", BYTES, "raw", struct.pack("<I", 0), START_NS)
+        for i in range(100):
+            log.raw("/early", BYTES, "raw", bytes(100), START_NS + 1 + i)
+        for i in range(50):
+            log.raw("/late", BYTES, "raw", struct.pack("<I", 1 + i), START_NS + 200 + i)
+    _, _, log = read(tmp_path / "log.mcap")
+    log.known_chunks[0, min(offset for _, offset in log.known_chunks)] = KnownChunk(
+        frozenset(), 0, 0
+    )
+    assert len(list(log.messages(lambda channel: channel.topic == "/late"))) == 50
+
+
+@pytest.mark.parametrize("chunking", [True, False])
+def test_a_log_that_grows_is_read_as_it_was_when_it_was_opened(tmp_path, chunking):
+    content = write(tmp_path / "log.mcap", use_chunking=chunking).read_bytes()
+    growing = tmp_path / "growing.mcap"
+    growing.write_bytes(content[: len(content) // 2])
+    losses = LossLedger()
+    log = McapLog(growing, log_files(growing), losses)
+    fingerprint = log.fingerprint()
+    messages = log.messages()
+    first = [next(messages)]
+    growing.write_bytes(content)
+    first += messages
+    assert 80 < len(first) < 110
+    assert numbers(log.messages()) == numbers(first)
+    assert log.fingerprint() == fingerprint
+    assert [loss.what for loss in losses] == ["log ends early"]
 
 
 @pytest.mark.parametrize("chunking", [True, False])
