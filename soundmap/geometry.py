@@ -197,15 +197,21 @@ class Trajectory:
         Whether the pose may be trusted: particles concentrated and laser scans matching the map.
     covariance : ndarray, shape (K, 3, 3), or None
         Of x, y [m] and heading [rad], where it is known.
+    is_scan : ndarray of bool, shape (K,), or None
+        Which poses are those of laser scans; where scans are rare, odometry carries others between
+        them. None: all.
     """
 
     time_ns: NDArray[np.int64]
     pose: FloatArray
     usable: NDArray[np.bool_]
     covariance: FloatArray | None = None
+    is_scan: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         count = len(self.time_ns)
+        if self.is_scan is not None and self.is_scan.shape != (count,):
+            raise ValueError("a trajectory needs to say of each pose whether it is a scan's")
         if self.covariance is not None and self.covariance.shape != (count, 3, 3):
             raise ValueError("a trajectory needs one covariance (3, 3) a time")
         if self.pose.shape != (count, 3) or self.usable.shape != (count,):
@@ -241,6 +247,14 @@ class Trajectory:
         pose[..., 2] = wrapped_angle(start[..., 2] + share[..., 0] * turn)
         outside = (wanted < self.time_ns[0]) | (wanted > self.time_ns[-1])
         return np.where(outside[..., None], np.nan, pose)
+
+    def of_scans(self) -> Trajectory:
+        """The poses of laser scans alone."""
+        if self.is_scan is None:
+            return self
+        covariance = None if self.covariance is None else self.covariance[self.is_scan]
+        kept = self.is_scan
+        return Trajectory(self.time_ns[kept], self.pose[kept], self.usable[kept], covariance)
 
     def driven_m(self) -> FloatArray:
         """Distance driven from the first pose to each, along the poses [m], shape (K,)."""

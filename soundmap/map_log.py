@@ -114,7 +114,7 @@ def localized(
         counts={
             "laser scanners": len(log.scanners),
             "odometry poses": len(log.odometry),
-            "laser scans used": len(trajectory),
+            "laser scans used": len(trajectory.of_scans()),
         },
         timings_s=timings_s,
         duration_s=log.duration_s,

@@ -122,7 +122,7 @@ def process(
         power_map=power_map,
         sources=sources,
         losses=tuple(log.losses),
-        counts=_counts(log, len(trajectory), len(scans), fused),
+        counts=_counts(log, len(trajectory.of_scans()), len(scans), fused),
         timings_s=clock.timings_s,
         duration_s=duration_s,
     )

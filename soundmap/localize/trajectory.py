@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from soundmap.carrying import carried_poses, odometry_times_between
 from soundmap.config import LocalizeConfig
 from soundmap.errors import MapError
 from soundmap.geometry import FloatArray, Trajectory, relative
@@ -26,6 +27,8 @@ UNKNOWN_ODOMETRY = OdometryModel(
     noise_distance_per_metre=0.3, noise_turn_per_metre=0.2, noise_turn_per_turn=0.3
 )
 """What is believed of the odometry before the run has shown how good it is: not much."""
+RARE_NS = 600_000_000
+"""Between laser scans farther apart than this, odometry carries the pose."""
 ROUNDS = 4
 """Times that all poses are smoothed and it is judged anew which of them to trust."""
 
@@ -70,11 +73,12 @@ def estimate_trajectory(
     """
     losses = LossLedger() if losses is None else losses
     views = chosen_views(lasers, odometry, config, losses)
-    return localized(views, room, config, start_pose=start_pose, losses=losses)
+    return localized(views, odometry, room, config, start_pose=start_pose, losses=losses)
 
 
 def localized(
     views: Views,
+    odometry: Trajectory,
     room: OccupancyGrid,
     config: LocalizeConfig,
     *,
@@ -91,7 +95,7 @@ def localized(
             estimate = _smoothed(estimate, views, room, config)
         else:
             estimate = _filtered(estimate, views, room, config)
-    return _checked(estimate, views, room, losses)
+    return _joined(_checked(estimate, views, room, losses), odometry)
 
 
 @dataclass(frozen=True)
@@ -187,6 +191,26 @@ def _checked(
         estimate.pose[last_of_its_time],
         usable,
         None if covariance is None else covariance[last_of_its_time],
+    )
+
+
+def _joined(known: Trajectory, odometry: Trajectory) -> Trajectory:
+    """The trajectory with poses carried by odometry between laser scans that are far apart."""
+    between = odometry_times_between(known.time_ns, odometry, rare_ns=RARE_NS)
+    if len(between) == 0:
+        return known
+    time_ns = np.union1d(known.time_ns, between)
+    pose, before, after = carried_poses(time_ns, odometry, known.time_ns, known.pose)
+    covariance = known.covariance
+    if covariance is not None:
+        size = np.trace(covariance[:, :2, :2], axis1=1, axis2=2)
+        covariance = covariance[np.where(size[before] > size[after], before, after)]
+    return Trajectory(
+        time_ns,
+        pose,
+        known.usable[before] & known.usable[after],
+        covariance,
+        np.isin(time_ns, known.time_ns),
     )
 
 

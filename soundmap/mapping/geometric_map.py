@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from soundmap.carrying import carried_poses, odometry_times_between
 from soundmap.config import MappingConfig
-from soundmap.geometry import FloatArray, Trajectory, composed, inverted, relative, wrapped_angle
+from soundmap.geometry import FloatArray, Trajectory, composed, inverted, relative
 from soundmap.grid import OccupancyGrid
 from soundmap.losses import LossLedger
 from soundmap.mapping.growing_graph import GrowingGraph
@@ -157,10 +158,10 @@ def build_map(
     )
     facts = _facts(keys, pose, links, graph.matched, search, model)
     pose = composed(inverted(pose[0]), pose)
-    times = pose_times(keys.time_ns, odometry)
+    key_ns = np.array([key.time_ns for key in keys.scans], dtype=np.int64)
     return BuiltMap(
         drawn_map(keys.scans, pose, cell_m=config.cell_m, occupied_share=config.occupied_share),
-        carried_trajectory(times, odometry, keys.scans, pose, graph.matched),
+        carried_trajectory(keys.time_ns, odometry, key_ns, pose, graph.matched),
         facts,
     )
 
@@ -276,60 +277,27 @@ def _fitted_model(
 
 
 def carried_trajectory(
-    time_ns: NDArray[np.int64],
+    scan_ns: NDArray[np.int64],
     odometry: Trajectory,
-    scans: Sequence[KeyScan],
+    key_ns: NDArray[np.int64],
     pose: FloatArray,
     matched: NDArray[np.bool_],
 ) -> Trajectory:
-    """Poses at other times than those of the key scans, carried there by odometry.
-
-    Between two key scans the pose is that carried forward from the one blended with that carried
-    back from the other, by the way and the turn between them.
+    """Poses of all laser scans, and between rare ones of the odometry, from those of key scans.
 
     Parameters
     ----------
-    time_ns : ndarray of int64, shape (S,)
-        Increasing, within the time of the odometry.
+    scan_ns : ndarray of int64, shape (S,)
+        Times of the laser scans, increasing, within the time of the odometry.
     odometry : Trajectory
-    scans : sequence of KeyScan
+    key_ns : ndarray of int64, shape (K,)
     pose : ndarray, shape (K, 3)
         Of the key scans.
     matched : ndarray of bool, shape (K,)
         Whether a key scan fits the map.
     """
-    key_ns = np.array([scan.time_ns for scan in scans], dtype=np.int64)
-    key_odometry = np.array([scan.odometry for scan in scans])
-    reported = odometry.at(time_ns)
-    after = np.clip(np.searchsorted(key_ns, time_ns, side="right"), 1, max(len(key_ns) - 1, 1))
-    before, after = after - 1, np.minimum(after, len(key_ns) - 1)
-    forward = composed(pose[before], relative(key_odometry[before], reported))
-    backward = composed(pose[after], relative(key_odometry[after], reported))
-    progress = motion_progress(odometry)
-    own = np.interp(time_ns, odometry.time_ns, progress)
-    key = np.interp(key_ns, odometry.time_ns, progress)
-    way = np.maximum(key[after] - key[before], 1e-9)
-    share = np.clip((own - key[before]) / way, 0.0, 1.0)
-    share[time_ns >= key_ns[after]] = 1.0
-    blended = forward + share[:, None] * (backward - forward)
-    turn = wrapped_angle(backward[:, 2] - forward[:, 2])
-    blended[:, 2] = wrapped_angle(forward[:, 2] + share * turn)
-    return Trajectory(time_ns, blended, matched[before] | matched[after])
-
-
-def motion_progress(odometry: Trajectory) -> FloatArray:
-    """Way [m] and turn [rad] up to each pose of the odometry added up, and a trace of time."""
-    turned = np.cumsum(
-        np.abs(wrapped_angle(np.diff(odometry.pose[:, 2], prepend=odometry.pose[:1, 2])))
-    )
-    elapsed_s = (odometry.time_ns - odometry.time_ns[0]) * 1e-9
-    return odometry.driven_m() + turned + 1e-6 * elapsed_s
-
-
-def pose_times(laser_ns: NDArray[np.int64], odometry: Trajectory) -> NDArray[np.int64]:
-    """Times of the laser scans, and those of the odometry wherever laser scans are rare."""
-    inside = (odometry.time_ns > laser_ns[0]) & (odometry.time_ns < laser_ns[-1])
-    times = odometry.time_ns[inside]
-    after = np.searchsorted(laser_ns, times)
-    rare = laser_ns[after] - laser_ns[np.maximum(after - 1, 0)] > RARE_NS
-    return np.unique(np.concatenate([laser_ns, times[rare]]))
+    between = odometry_times_between(scan_ns, odometry, rare_ns=RARE_NS)
+    time_ns = np.union1d(scan_ns, between)
+    carried, before, after = carried_poses(time_ns, odometry, key_ns, pose)
+    usable = matched[before] | matched[after]
+    return Trajectory(time_ns, carried, usable, is_scan=np.isin(time_ns, scan_ns))

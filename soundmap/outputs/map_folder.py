@@ -14,7 +14,7 @@ from soundmap.outputs.new_folder import REPORT, writing
 from soundmap.outputs.picture_format import PictureFormat
 from soundmap.outputs.pictures import Pictures, write_pictures
 from soundmap.outputs.report import json_text, provenance, trajectory_summary
-from soundmap.outputs.run_folder import tum_text
+from soundmap.outputs.run_folder import trajectory_arrays, tum_text, write_arrays
 from soundmap.run import MapRun
 
 if TYPE_CHECKING:
@@ -43,6 +43,7 @@ def write_map_run(
         for name, content in map_files(run.room).items():
             (folder / name).write_bytes(content)
         (folder / "trajectory.tum").write_text(tum_text(run.trajectory), encoding="ascii")
+        write_arrays(folder / "trajectory.npz", trajectory_arrays(run.trajectory))
         (folder / "config.toml").write_text(config_toml(run.config), encoding="utf-8")
         write_pictures(lambda: _pictures(run), folder, figures)
         report = map_report(run, {**run.timings_s, "outputs": time.perf_counter() - start})

@@ -207,10 +207,10 @@ def provenance() -> dict[str, Any]:
 
 
 def trajectory_summary(trajectory: Trajectory) -> dict[str, Any]:
-    """Number of poses, way driven [m], and the share of poses to be trusted."""
+    """Poses of laser scans, way driven [m], and the share of poses to be trusted."""
     steps = np.diff(trajectory.pose[:, :2], axis=0)
     return {
-        "poses": len(trajectory),
+        "poses": len(trajectory.of_scans()),
         "length_m": float(np.hypot(steps[:, 0], steps[:, 1]).sum()),
         "usable_share": float(trajectory.usable.mean()) if len(trajectory) else None,
     }

@@ -57,7 +57,7 @@ def write_run(
     share = run.config.detect.min_visit_share
     with writing(folder):
         (folder / "trajectory.tum").write_text(tum_text(run.trajectory), encoding="ascii")
-        write_arrays(folder / "trajectory.npz", _trajectory_arrays(run.trajectory))
+        write_arrays(folder / "trajectory.npz", trajectory_arrays(run.trajectory))
         write_arrays(
             folder / "power_map.npz", power_map_arrays(run.power_map, min_visit_share=share)
         )
@@ -130,7 +130,7 @@ def write_diff(
 
 
 def tum_text(trajectory: Trajectory) -> str:
-    r"""One line a pose: ``timestamp tx ty tz qx qy qz qw``, seconds exact to the nanosecond.
+    r"""One line a laser scan: ``timestamp tx ty tz qx qy qz qw``, seconds exact to the nanosecond.
 
     Examples
     --------
@@ -138,6 +138,7 @@ def tum_text(trajectory: Trajectory) -> str:
     >>> tum_text(Trajectory(np.array([1700000000000000007]), pose, np.array([True])))
     '1700000000.000000007 1.000000 2.000000 0 0 0 1.000000000 0.000000000\n'
     """
+    trajectory = trajectory.of_scans()
     half = trajectory.pose[:, 2] / 2.0
     rows = zip(
         trajectory.time_ns.tolist(),
@@ -194,12 +195,14 @@ def _audio_scan_arrays(scans: AudioScans) -> dict[str, ArrayLike]:
     }
 
 
-def _trajectory_arrays(trajectory: Trajectory) -> dict[str, ArrayLike]:
+def trajectory_arrays(trajectory: Trajectory) -> dict[str, ArrayLike]:
     """What the TUM format cannot say, too: which poses may be trusted, and how far."""
     known: dict[str, ArrayLike] = {}
     covariance = trajectory.covariance
     if covariance is not None:
         known["covariance"] = covariance
+    if trajectory.is_scan is not None:
+        known["is_scan"] = trajectory.is_scan
     return {
         "time_ns": trajectory.time_ns,
         "pose": trajectory.pose,

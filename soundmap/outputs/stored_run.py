@@ -289,7 +289,8 @@ def _index(name: str) -> int | None:
 
 
 def _trajectory(stored: Stored) -> Trajectory:
-    names = ("time_ns", "pose", "usable", *(["covariance"] if "covariance" in stored else []))
+    optional = (name for name in ("covariance", "is_scan") if name in stored)
+    names = ("time_ns", "pose", "usable", *optional)
     return Trajectory(**{name: stored[name] for name in names})
 
 

@@ -290,4 +290,6 @@ def test_scans_far_apart_with_poor_odometry_are_still_aligned():
     position, heading = errors(estimate)
     assert np.median(position[estimate.usable]) < 0.03
     assert np.degrees(heading[estimate.usable].mean()) < 0.8
+    assert len(estimate.of_scans()) == len(sparse)
+    assert len(estimate) > 10 * len(sparse), "odometry carries the pose between the scans"
     assert estimate.usable.mean() > 0.9

@@ -1,11 +1,12 @@
 import numpy as np
 import pytest
 
+from soundmap.carrying import odometry_times_between
 from soundmap.config import MappingConfig
 from soundmap.errors import NothingUsableError
 from soundmap.geometry import Trajectory, composed, transformed
 from soundmap.losses import LossLedger
-from soundmap.mapping.geometric_map import build_map, carried_trajectory, pose_times
+from soundmap.mapping.geometric_map import build_map, carried_trajectory
 from tests import worlds
 from tests.mapping import drives
 
@@ -96,17 +97,11 @@ def test_between_key_scans_the_correction_is_spread_over_the_way():
     time_ns = np.arange(11, dtype=np.int64) * 10**8
     way = np.column_stack([np.arange(11) * 0.1, np.zeros((11, 2))])
     odometry = Trajectory(time_ns, way, np.ones(11, dtype=bool))
-    key = drives.keys(
-        worlds.laser_scans(worlds.driven([(1, 1), (1.1, 1)]), [worlds.FRONT]),
-        worlds.driven([(1, 1), (1.1, 1)]),
-    ).scans[0]
-    pair = [
-        type(key)(**{**vars(key), "time_ns": int(time_ns[k]), "odometry": way[k]}) for k in (0, 10)
-    ]
     pose = composed(np.array([5.0, 5.0, np.pi / 2]), np.array([[0.0, 0, 0], [1.1, 0, 0]]))
-    found = carried_trajectory(time_ns, odometry, pair, pose, np.array([True, False]))
+    matched = np.array([True, False])
+    found = carried_trajectory(time_ns, odometry, time_ns[[0, 10]], pose, matched)
     np.testing.assert_allclose(found.pose[:, 1], 5.0 + 0.11 * np.arange(11), atol=1e-5)
-    assert found.usable.all()
+    assert found.usable[:10].all()
 
 
 def test_rare_scans_are_joined_by_the_poses_of_the_odometry():
@@ -114,9 +109,11 @@ def test_rare_scans_are_joined_by_the_poses_of_the_odometry():
         np.arange(101, dtype=np.int64) * 10**8, np.zeros((101, 3)), np.ones(101, dtype=bool)
     )
     laser_ns = np.array([50, 100, 150, 4000, 4100]) * 10**6
-    found = pose_times(laser_ns, odometry)
-    assert set(laser_ns) <= set(found)
-    between = found[~np.isin(found, laser_ns)]
+    between = odometry_times_between(laser_ns, odometry, rare_ns=200 * 10**6)
     assert between.min() == 200 * 10**6
     assert between.max() == 3900 * 10**6
     assert len(between) == 38
+    ends = laser_ns[[0, -1]]
+    found = carried_trajectory(laser_ns, odometry, ends, np.zeros((2, 3)), np.ones(2, bool))
+    assert len(found) == 5 + 38
+    assert found.of_scans().time_ns.tolist() == laser_ns.tolist()

@@ -76,6 +76,7 @@ def test_every_file_is_there_and_the_settings_can_be_used_again(run, tmp_path):
         "map.yaml",
         "map.png",
         "trajectory.tum",
+        "trajectory.npz",
         "report.json",
         "config.toml",
     }

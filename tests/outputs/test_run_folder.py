@@ -94,6 +94,13 @@ def test_the_trajectory_is_exact_to_the_nanosecond_and_its_quaternions_are_rotat
     np.testing.assert_allclose(np.cos(heading - trajectory.pose[:, 2]), 1.0, atol=1e-9)
 
 
+def test_the_trajectory_has_one_line_a_laser_scan():
+    time_ns = 1_700_000_000_000_000_000 + np.arange(4, dtype=np.int64)
+    is_scan = np.array([True, False, False, True])
+    text = tum_text(Trajectory(time_ns, np.zeros((4, 3)), np.ones(4, bool), is_scan=is_scan))
+    assert [line.split()[0][-1] for line in text.splitlines()] == ["0", "3"]
+
+
 def test_times_before_1970_and_around_it_are_written_right():
     time_ns = np.array([-1_500_000_000, -1, 0, 1])
     text = tum_text(Trajectory(time_ns, np.zeros((4, 3)), np.ones(4, dtype=bool)))
