@@ -206,6 +206,13 @@ class ScanConfig(Table):
         )
 
 
+class CalibrateConfig(Table):
+    """Error of the array's clock and yaw, from the run itself."""
+
+    mode: Literal["correct", "report", "off"] = "correct"
+    """"correct": estimate both and correct what is clear; "report": only tell; "off"."""
+
+
 class FuseConfig(Table):
     """Emitted power and its accumulation, Sect. 2.4 and Table 1."""
 
@@ -266,6 +273,7 @@ class Config(Table):
     map: MappingConfig = MappingConfig()
     localize: LocalizeConfig = LocalizeConfig()
     scan: ScanConfig = ScanConfig()
+    calibrate: CalibrateConfig = CalibrateConfig()
     fuse: FuseConfig = FuseConfig()
     detect: DetectConfig = DetectConfig()
     diff: DiffConfig = DiffConfig()

@@ -142,6 +142,11 @@ class Mount:
             self.rotation @ inner.translation_m + self.translation_m,
         )
 
+    def turned(self, yaw_rad: float) -> Mount:
+        """The mount turned about the vertical, counter-clockwise seen from above [rad]."""
+        turn = Mount.planar(0.0, 0.0, 0.0, yaw_rad)
+        return Mount(turn.rotation @ self.rotation, self.translation_m)
+
     def inverse(self) -> Mount:
         """The transform from the base frame to the sensor's."""
         return Mount(self.rotation.T, -self.rotation.T @ self.translation_m)

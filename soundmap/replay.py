@@ -1,13 +1,15 @@
-"""The whole pipeline on one page: log, localize, scan, fuse, detect."""
+"""The whole pipeline on one page: log, localize, scan, calibrate, fuse, detect."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import Protocol, TypeVar
 
+from soundmap.calibrate.calibration import array_offsets
 from soundmap.config import Config, ScanConfig
 from soundmap.detect.fitted_sources import fitted_sources
 from soundmap.detect.place_levels import with_level_errors
@@ -27,7 +29,8 @@ from soundmap.outputs.progress import Progress, Stage
 from soundmap.run import Run
 from soundmap.scan.audio_scan import audio_scans, kept_scans
 from soundmap.scan.spectrum import band_bins
-from soundmap.sensors import AudioBlock, LaserScan
+from soundmap.sensors import ArrayOffsets, AudioBlock, LaserScan, MicArray
+from soundmap.sound import AudioScans
 
 THREADS = 2
 """Threads that turn sound into audio scans while the log is read."""
@@ -77,7 +80,14 @@ def process(
         blocks = _audio_of(measured, gatherer.see)
         reference = level_reference(array.pascal_per_count)
         scans = kept_scans(
-            audio_scans(blocks, array, config.scan, losses=log.losses, threads=THREADS),
+            audio_scans(
+                blocks,
+                array,
+                config.scan,
+                losses=log.losses,
+                threads=THREADS,
+                sharp=config.calibrate.mode != "off",
+            ),
             reference,
             array.mount,
             config.scan.sub_band_hz,
@@ -88,6 +98,8 @@ def process(
             f"{log_path}: the audio is too short or too broken for one audio scan of "
             f"{config.scan.frames} windows."
         )
+    with clock.stage("calibrate"):
+        scans, array, offsets = _calibrated(scans, array, trajectory, config)
     with clock.stage("fuse"):
         accumulator = PowerAccumulator(power_map_frame(room, config.fuse.cell_m), reference)
         fused = sum(
@@ -125,7 +137,23 @@ def process(
         counts=_counts(log, len(trajectory.of_scans()), len(scans), fused),
         timings_s=clock.timings_s,
         duration_s=duration_s,
+        offsets=offsets,
     )
+
+
+def _calibrated(
+    scans: AudioScans, array: MicArray, trajectory: Trajectory, config: Config
+) -> tuple[AudioScans, MicArray, ArrayOffsets | None]:
+    """Scans and array with clock and yaw corrected where they are clearly off, and by how much."""
+    if scans.sharp is None:
+        return scans, array, None
+    found = array_offsets(
+        scans.sharp, scans.time_ns, trajectory, array.mount, config.scan, config.calibrate
+    )
+    mount = array.mount.turned(found.yaw.correction)
+    time_ns = scans.time_ns + round(found.clock.correction * 1e9)
+    scans = replace(scans, time_ns=time_ns, mount=mount, sharp=None)
+    return scans, replace(array, mount=mount), found
 
 
 def _placed(

@@ -9,6 +9,7 @@ from soundmap.config import Config
 from soundmap.geometry import Trajectory
 from soundmap.grid import OccupancyGrid
 from soundmap.losses import Loss
+from soundmap.sensors import ArrayOffsets
 from soundmap.sound import AudioScans, PowerMap, SourceList
 
 
@@ -42,6 +43,9 @@ class Run:
         Wall time of each stage [s].
     duration_s : float
         Time from the first to the last message of the log [s].
+    offsets : ArrayOffsets or None
+        How far the array's clock and yaw were off; scans and mount are corrected by what was clear.
+        None if it was not asked for.
     """
 
     log: Path
@@ -56,6 +60,7 @@ class Run:
     counts: dict[str, int]
     timings_s: dict[str, float]
     duration_s: float
+    offsets: ArrayOffsets | None = None
 
 
 @dataclass(frozen=True)

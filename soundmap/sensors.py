@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
@@ -115,3 +116,60 @@ class MicArray:
     def microphones(self) -> int:
         """:math:`Q`, how many microphones there are."""
         return len(self.positions_m)
+
+
+class OffsetVerdict(StrEnum):
+    """What became of an offset that was estimated."""
+
+    CORRECTED = "corrected"
+    CLEAR = "off, not corrected"
+    NOUGHT = "taken as right"
+    UNKNOWN = "cannot be told"
+
+
+@dataclass(frozen=True)
+class Offset:
+    """An offset of the array, as estimated from a run.
+
+    Attributes
+    ----------
+    value : float
+        To be added to what was believed; NaN if nothing is known.
+    sigma : float
+        Its standard deviation, in the same unit.
+    verdict : OffsetVerdict
+    """
+
+    value: float
+    sigma: float
+    verdict: OffsetVerdict
+
+    @property
+    def correction(self) -> float:
+        """What was added: the value, or nought if it was left as it is."""
+        return self.value if self.verdict is OffsetVerdict.CORRECTED else 0.0
+
+
+@dataclass(frozen=True)
+class ArrayOffsets:
+    """How far the array's clock and mount are off.
+
+    Attributes
+    ----------
+    clock : Offset
+        Of the audio's clock against that of lasers and odometry [s].
+    yaw : Offset
+        Of the array's direction, counter-clockwise seen from above [rad].
+    explained : float
+        Share of what was heard, by the information it holds, that comes from fixed places.
+    places : int
+        Fixed places heard, sources and mirror images, each counted once a stretch of the way.
+    why : str
+        Why something cannot be told, in a sentence's part; empty if both can.
+    """
+
+    clock: Offset
+    yaw: Offset
+    explained: float
+    places: int
+    why: str = ""

@@ -129,6 +129,8 @@ class AudioScans:
         Power of each part of the band [linear]; None if they were not told apart.
     sub_band_hz : tuple of float
         The B + 1 edges of those parts [Hz].
+    sharp : ndarray of float32, shape (S, N), or None
+        As `AudioScan.sharp`; None if it was not asked for, or is no longer needed.
     """
 
     time_ns: NDArray[np.int64]
@@ -138,9 +140,12 @@ class AudioScans:
     mount: Mount | None = None
     sub_bands: NDArray[np.float32] | None = None
     sub_band_hz: tuple[float, ...] = ()
+    sharp: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         scans, bearings = len(self.time_ns), len(self.bearing_rad)
+        if self.sharp is not None and self.sharp.shape != (scans, bearings):
+            raise ValueError("audio scans need one sharp power a time and bearing")
         if self.power.shape != (scans, bearings):
             raise ValueError("audio scans need one power a time and bearing")
         parts = max(len(self.sub_band_hz) - 1, 0)

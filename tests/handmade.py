@@ -11,6 +11,7 @@ from soundmap.geometry import Trajectory
 from soundmap.grid import GridFrame, OccupancyGrid
 from soundmap.losses import Loss
 from soundmap.run import Run
+from soundmap.sensors import ArrayOffsets, Offset, OffsetVerdict
 from soundmap.sound import (
     AudioScans,
     LevelReference,
@@ -105,6 +106,13 @@ def fitted_run(log: Path = Path("logs/run1.mcap")) -> Run:
     images = (Reflection(3.1, -0.4, 1e-8, 0), Reflection(9.0, 9.0, 5e-9, None))
     sources = (replace(sure, fit=near), replace(doubtful, fit=far))
     return replace(run, sources=SourceList(sources, FULL_SCALE, images))
+
+
+def calibrated_run(log: Path = Path("logs/run1.mcap")) -> Run:
+    """A run whose audio was late, and whose array was turned as believed."""
+    clock = Offset(0.0503, 0.0041, OffsetVerdict.CORRECTED)
+    yaw = Offset(np.radians(-0.3), np.radians(0.4), OffsetVerdict.NOUGHT)
+    return replace(made_run(log), offsets=ArrayOffsets(clock, yaw, 0.81, 5))
 
 
 def unlucky_run(log: Path = Path("logs/run1.mcap")) -> Run:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "soundmap"
-STAGES = {"logs", "mapping", "localize", "scan", "fuse", "detect"}
+STAGES = {"logs", "mapping", "localize", "scan", "calibrate", "fuse", "detect"}
 COMPOSERS = {
     "replay", "map_log", "retelling", "comparison", "cli", "cli_map", "cli_runs", "terminal",
 }  # fmt: skip

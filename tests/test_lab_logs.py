@@ -94,6 +94,25 @@ def test_by_default_every_source_is_found_and_nothing_else(tmp_path):
     assert false_alarms == 0
 
 
+def test_an_array_that_is_turned_is_found_out_and_its_sources_stay(tmp_path):
+    mount = tmp_path / "mount.toml"  # that of the log, but for 6 degrees
+    mount.write_text(f"[array]\nmount = [0.0, 0.0, 0.65, {np.radians(-6.0)}]\n")
+    soundmap(
+        "process", LAB / "run1.mcap", "--config", LAB / "robot.toml", "--config", mount,
+        "--map", LAB / "map.yaml", "--out", tmp_path / "run1", "--quiet",
+    )  # fmt: skip
+    array = json.loads((tmp_path / "run1" / "report.json").read_text())["array"]
+    assert array["yaw_verdict"] == "corrected"
+    assert array["yaw_offset_deg"] == pytest.approx(6.0, abs=0.5)
+    assert array["clock_offset_s"] == pytest.approx(0.0, abs=0.01)
+    errors, false_alarms = matched(rows(tmp_path / "run1" / "sources.csv"))
+    assert max(errors) <= 0.1
+    assert false_alarms == 0
+    with np.load(tmp_path / "run1" / "audio_scans.npz") as scans:
+        axis = np.degrees(np.arctan2(scans["array_rotation"][1, 0], scans["array_rotation"][0, 0]))
+    assert axis == pytest.approx(0.0, abs=0.5)
+
+
 def test_the_same_log_in_protobuf_under_other_names_gives_the_same_sources(runs, tmp_path):
     log = tmp_path / "site.mcap"
     reencoded_as_protobuf(

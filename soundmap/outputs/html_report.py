@@ -20,7 +20,7 @@ from soundmap.outputs.html_findings import (
     reflections_table,
     sources_table,
 )
-from soundmap.outputs.wording import NOTHING, number_text, printed_reference
+from soundmap.outputs.wording import NOTHING, array_text, number_text, printed_reference
 
 KINDS = ("appeared", "louder", "quieter", "gone", "unchanged", "untold")
 CAPTIONS = {
@@ -217,6 +217,8 @@ def _provenance(report: Mapping[str, Any]) -> str:
             facts[_words(key)] = str(report[key])
     if report.get("duration_s") is not None:
         facts["length of the log"] = f"{number_text(report['duration_s'], 1)} s"
+    if text := array_text(report.get("array")):
+        facts["microphone array"] = text
     if report.get("speed") is not None:
         facts["speed"] = f"{report['speed']:.3g} x real time"
     facts["time"] = _joined(

@@ -21,6 +21,7 @@ from soundmap.config import DiffConfig
 from soundmap.geometry import Trajectory
 from soundmap.losses import Loss
 from soundmap.run import Run
+from soundmap.sensors import ArrayOffsets
 from soundmap.sound import Source, SourceList, decibels
 
 SCHEMA_VERSION = 1
@@ -58,6 +59,7 @@ def run_report(run: Run, timings_s: Mapping[str, float]) -> dict[str, Any]:
         "sources": source_rows(run.sources),
         "reflections": reflection_rows(run.sources),
         "trajectory": trajectory_summary(run.trajectory),
+        "array": offsets_summary(run.offsets),
         "counts": dict(run.counts),
         "losses": [dataclasses.asdict(loss) for loss in run.losses],
         "timings_s": dict(timings_s),
@@ -213,4 +215,21 @@ def trajectory_summary(trajectory: Trajectory) -> dict[str, Any]:
         "poses": len(trajectory.of_scans()),
         "length_m": float(np.hypot(steps[:, 0], steps[:, 1]).sum()),
         "usable_share": float(trajectory.usable.mean()) if len(trajectory) else None,
+    }
+
+
+def offsets_summary(offsets: ArrayOffsets | None) -> dict[str, Any] | None:
+    """How far the array's clock and yaw were off and what came of it; None if nobody asked."""
+    if offsets is None:
+        return None
+    return {
+        "clock_offset_s": _finite(offsets.clock.value),
+        "clock_sigma_s": _finite(offsets.clock.sigma),
+        "clock_verdict": str(offsets.clock.verdict),
+        "yaw_offset_deg": _finite(math.degrees(offsets.yaw.value)),
+        "yaw_sigma_deg": _finite(math.degrees(offsets.yaw.sigma)),
+        "yaw_verdict": str(offsets.yaw.verdict),
+        "explained_share": offsets.explained,
+        "fixed_places": offsets.places,
+        "why": offsets.why,
     }

@@ -14,6 +14,7 @@ from rich.text import Text
 from soundmap.losses import when
 from soundmap.outputs.wording import (
     NOTHING,
+    array_text,
     chance_text,
     flags_text,
     level_text,
@@ -43,6 +44,7 @@ def run_view(report: Mapping[str, Any]) -> RenderableType:
         _lines(
             {
                 "Trajectory": f"{way['length_m']:.2f} m, {way['poses']} poses, {usable} usable",
+                "Array": array_text(report.get("array")),
                 "Used": ", ".join(f"{count} {_words(name)}" for name, count in _counts(report)),
                 "Time": _times(report["timings_s"]),
                 "Files": f"{report['folder']}/, to begin with report.html",

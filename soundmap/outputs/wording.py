@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 
 from soundmap.geometry import FloatArray
+from soundmap.sensors import OffsetVerdict
 
 NOTHING = "-"
 CHI_SQUARED_95 = 5.991
 """95 % of a normal distribution in the plane lie within this squared distance (2 degrees of
 freedom)."""
+UNKNOWN = str(OffsetVerdict.UNKNOWN)
 LEAST_CHANCE = 1e-6
 """Probabilities below this say more about the model than about the world."""
 
@@ -114,3 +116,27 @@ def _with_error(value: float | None, error: float | None, form: str) -> str:
     if value is None:
         return NOTHING
     return form.format(value) + ("" if error is None else f" ± {error:.1f}")
+
+
+def array_text(array: Mapping[str, Any] | None) -> str:
+    """How far the array's clock and yaw were off, in a line; empty if nobody asked.
+
+    Examples
+    --------
+    >>> array_text({"clock_offset_s": 0.0502, "clock_sigma_s": 0.0041, "clock_verdict": "corrected",
+    ...             "yaw_offset_deg": 0.31, "yaw_sigma_deg": 0.4, "yaw_verdict": "taken as right",
+    ...             "why": ""})
+    'clock +50 ± 4 ms, corrected; yaw +0.3 ± 0.4 degrees, taken as right'
+    """
+    if array is None:
+        return ""
+    clock, yaw = array["clock_verdict"], array["yaw_verdict"]
+    why = f": {array['why']}" if array["why"] else ""
+    if clock == yaw == UNKNOWN:
+        return f"clock and yaw {UNKNOWN}{why}"
+    if clock != UNKNOWN:
+        milliseconds = 1e3 * array["clock_offset_s"], 1e3 * array["clock_sigma_s"]
+        clock = f"{milliseconds[0]:+z.0f} ± {milliseconds[1]:.0f} ms, {clock}"
+    if yaw != UNKNOWN:
+        yaw = f"{array['yaw_offset_deg']:+z.1f} ± {array['yaw_sigma_deg']:.1f} degrees, {yaw}"
+    return f"clock {clock}; yaw {yaw}{why}"

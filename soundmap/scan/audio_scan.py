@@ -110,11 +110,12 @@ def kept_scans(
 ) -> AudioScans:
     """All audio scans of a run, in single precision; none without bearings if there are none.
 
-    The sub-bands are kept where all scans tell those that are asked for.
+    The sub-bands are kept where all scans tell those that are asked for, and so is sharp power.
     """
     time_ns: list[int] = []
     power: list[NDArray[np.float32]] = []
     sub_bands: list[NDArray[np.float32]] = []
+    sharp: list[NDArray[np.float32]] = []
     bearing_rad = np.empty(0)
     for scan in scans:
         time_ns.append(scan.time_ns)
@@ -122,6 +123,8 @@ def kept_scans(
         bearing_rad = scan.bearing_rad
         if scan.sub_bands is not None and len(scan.sub_bands) == len(sub_band_hz) - 1:
             sub_bands.append(scan.sub_bands.astype(np.float32, copy=False))
+        if scan.sharp is not None:
+            sharp.append(scan.sharp)
     told = len(sub_bands) == len(time_ns) > 0
     return AudioScans(
         np.array(time_ns, dtype=np.int64),
@@ -131,6 +134,7 @@ def kept_scans(
         mount,
         np.array(sub_bands) if told else None,
         sub_band_hz if told else (),
+        np.array(sharp) if len(sharp) == len(time_ns) > 0 else None,
     )
 
 

@@ -2,7 +2,7 @@ import re
 from html.parser import HTMLParser
 
 import pytest
-from handmade import fitted_run, made_ratio, made_run, unlucky_run
+from handmade import calibrated_run, fitted_run, made_ratio, made_run, unlucky_run
 
 from soundmap.config import DiffConfig
 from soundmap.outputs.html_report import report_html
@@ -58,6 +58,10 @@ def test_the_page_says_what_was_found_what_was_lost_and_how_it_was_made():
     assert page.says("90.0 %", "of the poses can be trusted")
     assert page.says("1294", "odometry pose is not finite", "motion taken from the twist")
     assert page.says("numpy", "localize 1.25 s", "min_visit_share = 0.1", "0123abcd")
+
+
+def test_the_page_tells_how_far_the_array_was_off():
+    assert page_of(calibrated_run()).says("microphone array", "clock +50 ± 4 ms, corrected")
 
 
 def test_the_page_tells_what_a_fit_knows():

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from handmade import made_ratio, made_run, unlucky_run
+from handmade import calibrated_run, made_ratio, made_run, unlucky_run
 from scipy.special import ellipeinc
 
 from soundmap.config import Config, DiffConfig
@@ -17,6 +17,7 @@ from soundmap.outputs.report import (
     run_report,
     source_rows,
 )
+from soundmap.sensors import ArrayOffsets, Offset, OffsetVerdict
 from soundmap.sound import LevelReference, Source, SourceList
 
 
@@ -85,6 +86,26 @@ def test_the_report_is_strict_json_with_the_rows_of_the_table_and_every_loss():
     assert report["log"] == "run1.mcap"
     assert report["versions"]["numpy"] == np.__version__
     assert Config.model_validate(report["config"]) == run.config
+
+
+def test_the_report_tells_how_far_the_array_was_off():
+    run = calibrated_run()
+    array = strictly_parsed(json_text(run_report(run, run.timings_s)))["array"]
+    assert array["clock_offset_s"] == 0.0503
+    assert array["clock_verdict"] == "corrected"
+    assert array["yaw_offset_deg"] == pytest.approx(-0.3)
+    assert array["yaw_verdict"] == "taken as right"
+    assert (array["explained_share"], array["fixed_places"], array["why"]) == (0.81, 5, "")
+    assert run_report(made_run(), run.timings_s)["array"] is None
+
+
+def test_offsets_that_nothing_is_known_of_are_null():
+    unknown = Offset(np.nan, np.nan, OffsetVerdict.UNKNOWN)
+    run = replace(made_run(), offsets=ArrayOffsets(unknown, unknown, 0.0, 0, "nothing was heard"))
+    array = strictly_parsed(json_text(run_report(run, run.timings_s)))["array"]
+    assert array["clock_offset_s"] is None
+    assert array["yaw_sigma_deg"] is None
+    assert array["why"] == "nothing was heard"
 
 
 def test_what_is_not_finite_becomes_null_and_numpy_numbers_become_numbers():

@@ -1,14 +1,16 @@
 import io
+import math
 from dataclasses import replace
 
 import pytest
-from handmade import fitted_run, made_ratio, made_run, unlucky_run
+from handmade import calibrated_run, fitted_run, made_ratio, made_run, unlucky_run
 from rich.console import Console
 
 from soundmap.config import DiffConfig
 from soundmap.losses import Loss
 from soundmap.outputs.report import diff_report, run_report
 from soundmap.outputs.summary import diff_view, log_view, run_view
+from soundmap.sensors import ArrayOffsets, Offset, OffsetVerdict
 from soundmap.sound import LevelReference, Source, SourceList
 
 
@@ -41,6 +43,19 @@ def test_the_summary_tells_errors_and_remarks_where_a_fit_knows_them():
     assert rows[1][:8] == ["S2", "5.725", "3.375", "29", "x", "12", "-70.0", "17"]
     assert "not seen by laser" in " ".join(text.split())
     assert max(len(line) for line in text.splitlines()) <= 80
+
+
+def test_the_summary_tells_how_far_the_array_was_off():
+    text = " ".join(run_text(calibrated_run()).split())
+    assert "Array clock +50 ± 4 ms, corrected; yaw -0.3 ± 0.4 degrees, taken as right" in text
+    assert "Array" not in run_text(made_run())
+
+
+def test_the_summary_says_why_it_cannot_tell_how_far_the_array_was_off():
+    unknown = Offset(math.nan, math.nan, OffsetVerdict.UNKNOWN)
+    run = replace(made_run(), offsets=ArrayOffsets(unknown, unknown, 0.0, 0, "nothing was heard"))
+    text = " ".join(run_text(run).split())
+    assert "Array clock and yaw cannot be told: nothing was heard" in text
 
 
 def test_the_summary_fits_eighty_columns():

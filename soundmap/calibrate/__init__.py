@@ -1,0 +1,1 @@
+"""How far the array's clock and its mount are off, from the run itself."""

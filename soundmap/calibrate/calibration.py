@@ -1,0 +1,149 @@
+"""From the sharp audio scans of a run to the error of the array's clock and mount.
+
+Nothing is said where the evidence is not clear: where what was heard does not come from fixed
+places for the most part, where different starts end in different results, or where the way and
+the sources leave a result too uncertain to be of use.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soundmap.calibrate.bearing_fit import BearingFit, Stretch, WayAt, drifting_fit, rigid_fit
+from soundmap.calibrate.peaks import Peaks, clear_peaks
+from soundmap.calibrate.search import ballot, fixed_places, starting_points
+from soundmap.calibrate.way import Way, array_way, moved_apart
+from soundmap.config import CalibrateConfig, ScanConfig
+from soundmap.geometry import FloatArray, Mount, Trajectory
+from soundmap.sensors import ArrayOffsets, Offset, OffsetVerdict
+
+LEAST_SCANS = 40
+STRETCH_M, STRETCH_SCANS = 15.0, 400
+"""Places are sought on stretches of the way of this length, and no more scans."""
+MARGIN_NS = 250_000_000
+"""Poses are needed so long before and after a scan."""
+LEAST_EXPLAINED = 0.7
+EQUAL_SHARE = 0.02
+"""Fits that explain this much less than the best still count as equal to it."""
+SYSTEMATIC = np.array([0.0015, np.radians(0.2)])
+"""What the variance of the fit does not know of, as seen on simulated sites [s, rad]."""
+YAW_ALONE = np.array([0.0, 1.0])
+"""The yaw rests on where the places are, and one that is wrong may pull it; the clock on turns."""
+USEFUL = np.array([0.015, np.radians(1.5)])
+"""Results less certain than this, as a standard deviation, are of no use [s, rad]."""
+CLEAR_SIGMAS = 3.0
+
+
+def array_offsets(
+    sharp: NDArray[np.float32],
+    time_ns: NDArray[np.int64],
+    trajectory: Trajectory,
+    mount: Mount,
+    scan: ScanConfig,
+    calibrate: CalibrateConfig,
+) -> ArrayOffsets:
+    """How far the array's clock and yaw are off, and whether that is clear enough to correct it.
+
+    Parameters
+    ----------
+    sharp : ndarray of float32, shape (S, N)
+        Of the audio scans, on bearings 2 pi n / N; see `AudioScan.sharp`.
+    time_ns : ndarray of int64, shape (S,)
+        Middle of each scan, by the audio's clock.
+    trajectory : Trajectory
+        Base in the map frame.
+    mount : Mount
+        Array in the base frame, as believed.
+    scan : ScanConfig
+    calibrate : CalibrateConfig
+    """
+    span_s = (scan.frames - 1) * scan.hop_s + scan.window_s
+    usable = trajectory.usable_at(time_ns - MARGIN_NS) & trajectory.usable_at(time_ns + MARGIN_NS)
+    usable &= np.isfinite(sharp).all(axis=1)
+    sharp, time_ns = sharp[usable], time_ns[usable]
+
+    def way_at(clock_s: float) -> Way:
+        return array_way(trajectory, time_ns, mount, clock_s=clock_s, span_s=span_s)
+
+    if len(time_ns):
+        apart = moved_apart(way_at(0.0), time_ns)
+        sharp, time_ns = sharp[apart], time_ns[apart]
+    if len(time_ns) < LEAST_SCANS:
+        return _nothing("too few audio scans with a trusted pose")
+    peaks = _seen_from_above(clear_peaks(sharp), mount.handedness)
+    fits = _fits(peaks, way_at)
+    if not fits:
+        return _nothing("no fixed place was heard")
+    best = max(fits, key=lambda fit: fit.explained)
+    equal = [fit.state for fit in fits if fit.explained > best.explained - EQUAL_SHARE]
+    doubt = 0.5 * np.ptp(np.array(equal), axis=0)
+    final = drifting_fit(peaks, way_at, best)
+    mixed = final.spread * YAW_ALONE
+    sigma = np.sqrt(np.diag(final.covariance) + SYSTEMATIC**2 + doubt**2 + mixed**2)
+    return _judged(final, sigma, correct=calibrate.mode == "correct")
+
+
+def _seen_from_above(peaks: Peaks, handedness: int) -> Peaks:
+    """Peaks with bearings that run counter-clockwise, also of an array that hangs upside down."""
+    return Peaks(peaks.scan, handedness * peaks.bearing_rad, peaks.contrast)
+
+
+def _fits(peaks: Peaks, way_at: WayAt) -> list[BearingFit]:
+    """A rigid fit from each of the most promising starts."""
+    way = way_at(0.0)
+    spans = _stretches(way)
+    limits = [np.searchsorted(peaks.scan, ends) for ends in spans]
+    ballots = [ballot(way, peaks, first, last) for first, last in spans]
+    fits = []
+    for clock_s, yaw_rad in starting_points(ballots):
+        stretches = tuple(
+            Stretch(int(first), int(last), fixed_places(votes, clock_s, yaw_rad))
+            for (first, last), votes in zip(limits, ballots, strict=True)
+        )
+        stretches = tuple(s for s in stretches if len(s.place_m) and s.last > s.first)
+        if stretches:
+            fits.append(rigid_fit(peaks, way_at, stretches, (clock_s, yaw_rad)))
+    return fits
+
+
+def _stretches(way: Way) -> list[tuple[int, int]]:
+    """First and one past the last scan of each stretch of the way, all about as long."""
+    driven = way.driven_m()
+    count = max(1, round(driven[-1] / STRETCH_M), -(-len(way) // STRETCH_SCANS))
+    along = np.arange(len(way)) / len(way) + driven / max(driven[-1], 1e-9)
+    ends = np.searchsorted(along, np.linspace(0.0, 2.0, count + 1))
+    ends[-1] = len(way)
+    return [(int(a), int(b)) for a, b in pairwise(ends) if b > a]
+
+
+def _judged(fit: BearingFit, sigma: FloatArray, *, correct: bool) -> ArrayOffsets:
+    why = ""
+    if fit.explained < LEAST_EXPLAINED:
+        why = (
+            f"only {fit.explained:.0%} of what was heard comes from fixed places "
+            f"({LEAST_EXPLAINED:.0%} is needed)"
+        )
+    clock, yaw = (
+        _offset(float(value), float(spread), float(useful), told=not why, correct=correct)
+        for value, spread, useful in zip(fit.state, sigma, USEFUL, strict=True)
+    )
+    if not why and OffsetVerdict.UNKNOWN in (clock.verdict, yaw.verdict):
+        why = "turns and sources along the way leave it too uncertain"
+    places = sum(len(stretch.place_m) for stretch in fit.stretches)
+    return ArrayOffsets(clock, yaw, fit.explained, places, why)
+
+
+def _offset(value: float, sigma: float, useful: float, *, told: bool, correct: bool) -> Offset:
+    if not told or sigma > useful:
+        return Offset(value, sigma, OffsetVerdict.UNKNOWN)
+    if abs(value) <= CLEAR_SIGMAS * sigma:
+        return Offset(value, sigma, OffsetVerdict.NOUGHT)
+    return Offset(value, sigma, OffsetVerdict.CORRECTED if correct else OffsetVerdict.CLEAR)
+
+
+def _nothing(why: str) -> ArrayOffsets:
+    unknown = Offset(np.nan, np.nan, OffsetVerdict.UNKNOWN)
+    return ArrayOffsets(unknown, unknown, 0.0, 0, why)
