@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
-from typing import Protocol, TypeVar
 
 from soundmap.calibrate.calibration import array_offsets
 from soundmap.config import Config, ScanConfig
@@ -19,12 +18,11 @@ from soundmap.fuse.accumulate import PowerAccumulator
 from soundmap.fuse.bearing_range import ranges_around
 from soundmap.fuse.power_map import fused_scans, level_reference, power_map_frame
 from soundmap.fuse.surroundings import SurroundingsGatherer
-from soundmap.geometry import Trajectory
-from soundmap.grid import OccupancyGrid
-from soundmap.localize.trajectory import estimate_trajectory
+from soundmap.localize.trajectory import localized
+from soundmap.localize.views import ViewChooser
 from soundmap.logs.robot_log import RobotLog, open_log
 from soundmap.map_file import read_map
-from soundmap.mapping.geometric_map import build_map
+from soundmap.mapping.geometric_map import BuiltMap, build_map
 from soundmap.outputs.progress import Progress, Stage
 from soundmap.run import Run
 from soundmap.scan.audio_scan import audio_scans, kept_scans
@@ -63,7 +61,7 @@ def process(
     SoundmapError
         The log, the map or the configuration does not do.
     """
-    room = None if map_path is None else read_map(map_path)
+    given = None if map_path is None else read_map(map_path)
     clock = _Stopwatch(progress)
     with clock.stage("read"):
         log = open_log(log_path, config)
@@ -71,14 +69,14 @@ def process(
     if array is None:
         raise ValueError("the log was opened without audio")
     _check_band(log, config.scan)
-    start_ns, duration_s = int(log.odometry.time_ns[0]), log.duration_s
+    reference = level_reference(array.pascal_per_count)
 
-    room, trajectory = _placed(log, room, config, start_pose, clock)
-    with clock.stage("scan", duration_s) as stage:
-        gatherer = SurroundingsGatherer(log.odometry)
-        measured = _watched(log.measurements(), stage, start_ns)
-        blocks = _audio_of(measured, gatherer.see)
-        reference = level_reference(array.pascal_per_count)
+    built = _built_map(log, config, clock) if given is None else None
+    gatherer = SurroundingsGatherer(log.odometry)
+    chooser = ViewChooser(log.odometry, config.localize, log.losses)
+    watchers = [gatherer.see] if built is not None else [gatherer.see, chooser.see]
+    with clock.stage("scan", log.duration_s) as stage:
+        blocks = _audio_of(_watched(log, stage), watchers)
         scans = kept_scans(
             audio_scans(
                 blocks,
@@ -92,12 +90,25 @@ def process(
             array.mount,
             config.scan.sub_band_hz,
         )
-        surroundings = gatherer.gathered()
     if not len(scans):
         raise NothingUsableError(
             f"{log_path}: the audio is too short or too broken for one audio scan of "
             f"{config.scan.frames} windows."
         )
+    surroundings = gatherer.gathered()
+    if built is not None:
+        room, trajectory = built.room, built.trajectory
+    elif given is not None:
+        with clock.stage("localize"):
+            room, views = given, chooser.views()
+            trajectory = localized(
+                views,
+                log.odometry,
+                room,
+                config.localize,
+                start_pose=start_pose,
+                losses=log.losses,
+            )
     with clock.stage("calibrate"):
         scans, array, offsets = _calibrated(scans, array, trajectory, config)
     with clock.stage("fuse"):
@@ -136,7 +147,7 @@ def process(
         losses=tuple(log.losses),
         counts=_counts(log, len(trajectory.of_scans()), len(scans), fused),
         timings_s=clock.timings_s,
-        duration_s=duration_s,
+        duration_s=log.duration_s,
         offsets=offsets,
     )
 
@@ -156,26 +167,11 @@ def _calibrated(
     return scans, replace(array, mount=mount), found
 
 
-def _placed(
-    log: RobotLog,
-    room: OccupancyGrid | None,
-    config: Config,
-    start_pose: tuple[float, float, float] | None,
-    clock: _Stopwatch,
-) -> tuple[OccupancyGrid, Trajectory]:
-    """The geometric map and the trajectory in it; both from the log if no map is given."""
-    if room is None:
-        with clock.stage("map", 1.0) as stage:
-            built = build_map(
-                log.lasers, log.odometry, config.map, losses=log.losses, report=stage.advance_to
-            )
-        return built.room, built.trajectory
-    with clock.stage("localize", log.duration_s) as stage:
-        lasers = _watched(log.lasers(), stage, int(log.odometry.time_ns[0]))
-        trajectory = estimate_trajectory(
-            lasers, log.odometry, room, config.localize, start_pose=start_pose, losses=log.losses
+def _built_map(log: RobotLog, config: Config, clock: _Stopwatch) -> BuiltMap:
+    with clock.stage("map", 1.0) as stage:
+        return build_map(
+            log.lasers, log.odometry, config.map, losses=log.losses, report=stage.advance_to
         )
-    return room, trajectory
 
 
 def _check_band(log: RobotLog, scan: ScanConfig) -> None:
@@ -188,12 +184,13 @@ def _check_band(log: RobotLog, scan: ScanConfig) -> None:
 
 
 def _audio_of(
-    measured: Iterable[AudioBlock | LaserScan], see: Callable[[LaserScan], None]
+    measured: Iterable[AudioBlock | LaserScan], watchers: Sequence[Callable[[LaserScan], None]]
 ) -> Iterator[AudioBlock]:
-    """The audio among what was measured; laser scans are shown to ``see`` as they come by."""
+    """The audio among what was measured; laser scans are shown to the watchers as they come by."""
     for item in measured:
         if isinstance(item, LaserScan):
-            see(item)
+            for see in watchers:
+                see(item)
         else:
             yield item
 
@@ -213,18 +210,10 @@ class _Stopwatch:
         self.timings_s[name] = perf_counter() - began
 
 
-class _Timed(Protocol):
-    @property
-    def time_ns(self) -> int: ...
-
-
-_Item = TypeVar("_Item", bound=_Timed)
-
-
-def _watched(items: Iterable[_Item], stage: Stage, start_ns: int) -> Iterator[_Item]:
-    """The same items, with the progress reported once a second of the log."""
-    reported_ns = start_ns
-    for item in items:
+def _watched(log: RobotLog, stage: Stage) -> Iterator[AudioBlock | LaserScan]:
+    """What was measured, with the progress reported once a second of the log."""
+    start_ns = reported_ns = int(log.odometry.time_ns[0])
+    for item in log.measurements():
         if item.time_ns - reported_ns > 1_000_000_000:
             stage.advance_to((item.time_ns - start_ns) * 1e-9)
             reported_ns = item.time_ns

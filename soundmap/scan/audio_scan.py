@@ -224,6 +224,8 @@ class _Scanner:
     table: SteeringTable
     microphones: int
     sharp: bool
+    batch: int
+    """Scans in a batch."""
     _own: local
 
     @classmethod
@@ -243,16 +245,14 @@ class _Scanner:
             splits=_splits(band.frequency_hz, config.sub_band_hz),
         )
         square = _square_of_unit(array, full_scale)
-        return cls(rate_hz, full_scale, square, framing, table, array.microphones, sharp, local())
+        batch = int(np.clip(BATCH_BYTES // (4 * np.prod(table.spectra_shape)), 4, BATCH))
+        return cls(
+            rate_hz, full_scale, square, framing, table, array.microphones, sharp, batch, local()
+        )
 
     def suits(self, block: AudioBlock) -> bool:
         """Whether the block's samples are of that rate and full scale."""
         return block.rate_hz == self.rate_hz and block.full_scale == self.full_scale
-
-    @property
-    def batch(self) -> int:
-        """Scans in a batch."""
-        return int(np.clip(BATCH_BYTES // (4 * np.prod(self.table.spectra_shape)), 4, BATCH))
 
     def scans(self, time_ns: list[int], samples: NDArray[Any]) -> list[AudioScan]:
         """A batch of scans at these times from the samples (T, Q) of all.
