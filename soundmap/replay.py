@@ -18,6 +18,7 @@ from soundmap.fuse.accumulate import PowerAccumulator
 from soundmap.fuse.bearing_range import ranges_around
 from soundmap.fuse.power_map import fused_scans, level_reference, power_map_frame
 from soundmap.fuse.surroundings import SurroundingsGatherer
+from soundmap.geometry import Trajectory
 from soundmap.localize.trajectory import localized
 from soundmap.localize.views import ViewChooser
 from soundmap.logs.robot_log import RobotLog, open_log

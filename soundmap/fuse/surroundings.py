@@ -72,12 +72,12 @@ class SurroundingsGatherer:
                 continue
             if scan.scanner not in nearest or away_ns < nearest[scan.scanner][0]:
                 nearest[scan.scanner] = away_ns, scan
-        rays = [
+        points = [
             deskewed_rays(nearest[scanner][1], self._odometry, time_ns).end_m
             for scanner in sorted(nearest)
         ]
         self._time_ns.append(time_ns)
-        self._point_m.append(thinned(np.concatenate(rays), DIRECTIONS).astype(np.float16))
+        self._point_m.append(thinned(np.concatenate(points), DIRECTIONS).astype(np.float16))
 
 
 def gathered_surroundings(lasers: Iterable[LaserScan], odometry: Trajectory) -> Surroundings:

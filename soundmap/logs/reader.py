@@ -23,7 +23,8 @@ from mcap.records import Channel as ChannelRecord
 from mcap.records import Schema
 
 from soundmap.errors import LogError
-from soundmap.logs.chunk import MAX_CHUNK_BYTES, chunk_content
+from soundmap.logs.chunk import MAX_CHUNK_BYTES
+from soundmap.logs.chunk_ahead import ChunkAhead
 from soundmap.logs.file_summary import (
     MAGIC,
     RECORD_DAMAGE,
@@ -174,6 +175,7 @@ class _FileWalk:
         self.channels = dict(log.known_channels.get(number, {}))
         self.selected: dict[int, Channel | None] = {}
         self.summary = FileSummary()
+        self.ahead = ChunkAhead(file, self.size, self._to_check)
         self.chunked = False
         self.last_ns = 0
         self.messages = 0
@@ -181,7 +183,10 @@ class _FileWalk:
     def batches(self) -> Iterator[Batch]:
         """Messages chunk by chunk."""
         loose, loose_ns, loose_bytes = list[Message](), list[int](), 0
-        with self.file.open("rb", buffering=2**18) as stream:
+        with (
+            self.file.open("rb", buffering=2**14) as stream,
+            ChunkAhead(self.file, self.size, self._to_check) as self.ahead,
+        ):
             self.summary = file_summary(stream, self.size)
             for opcode, offset, length in self._records(stream):
                 if opcode == Opcode.CHUNK:
@@ -321,17 +326,26 @@ class _FileWalk:
         if channel_id not in self.channels and channel_id in self.summary.channels:
             self._add_channel(self.summary.channels[channel_id])
 
+    def _to_check(self, offset: int) -> bool | None:
+        """Whether to look at the checksum of a chunk; None if there is nothing wanted in it.
+
+        Checksums need no second look in later passes: a damaged chunk holds no channels.
+        """
+        known = self.log.known_chunks.get((self.number, offset))
+        if known is None:
+            return True
+        return False if any(self.wanted(channel) for channel in known.channels) else None
+
     def _chunk(self, stream: IO[bytes], offset: int, length: int) -> Batch | None:
         """The wanted messages of a chunk; None if it is damaged or empty."""
         place = (self.number, offset)
         known = self.log.known_chunks.get(place)
-        if known is not None and not any(self.wanted(channel) for channel in known.channels):
+        if known is not None and self._to_check(offset) is None:
             return Batch(known.first_ns, known.last_ns, []) if known.channels else None
         try:
             if length > MAX_CHUNK_BYTES:
                 raise ValueError(f"it is {length / 2**20:.0f} MiB long, more than is credible")
-            # Checksums need no second look in later passes: a damaged chunk holds no channels.
-            data = chunk_content(stream.read(length), check=known is None)
+            data = self.ahead.content(stream, offset, length)
         except RECORD_DAMAGE as error:
             self.log.count("damaged chunk", self.file.name, f"left out ({_reason(error)})")
             self.log.known_chunks[place] = KnownChunk(frozenset(), 0, 0)
