@@ -1,4 +1,7 @@
 import re
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 from handmade import made_ratio, made_run, walled_room
@@ -34,6 +37,23 @@ def test_a_picture_comes_in_the_format_asked_for_with_equal_bytes_every_time(tmp
         contents.append(file.read_bytes())
     assert contents[0][:5].startswith(OPENING[form])
     assert contents[0] == contents[1]
+
+
+def test_without_pictures_nothing_that_draws_is_loaded(tmp_path):
+    program = (
+        "import sys; sys.path.insert(0, sys.argv[1])\n"
+        "from pathlib import Path\n"
+        "from handmade import made_run\n"
+        "from soundmap.outputs.picture_format import PictureFormat\n"
+        "from soundmap.outputs.run_folder import write_run\n"
+        "write_run(made_run(), Path(sys.argv[2]), figures=PictureFormat.NONE)\n"
+        "print([name for name in ('matplotlib', 'PIL', 'rerun') if name in sys.modules])"
+    )
+    tests = str(Path(__file__).resolve().parents[1])
+    command = [sys.executable, "-c", program, tests, str(tmp_path)]
+    result = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert result.stdout == "[]\n"
+    assert (tmp_path / "report.html").is_file()
 
 
 def test_a_browser_is_given_what_it_can_show(tmp_path):
