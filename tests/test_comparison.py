@@ -1,5 +1,6 @@
 """Two run folders compared: nothing changes by itself, and what changes is told."""
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,10 +10,12 @@ import pytest
 from soundmap.change import ChangeKind
 from soundmap.comparison import compared
 from soundmap.config import Config
+from soundmap.geometry import inverted, relative, transformed
+from soundmap.grid import GridFrame, OccupancyGrid
 from soundmap.outputs.picture_format import PictureFormat
 from soundmap.outputs.run_folder import write_run
 from soundmap.sound import Reflection, Source, SourceFit, SourceList
-from tests.handmade import made_run
+from tests.handmade import made_run, walled_room
 from tests.heard import drive, heard_scans
 
 CONFIG = Config()
@@ -21,7 +24,14 @@ LOUDNESS = [4e-7, 1e-7, 2e-7]
 
 
 def folder(
-    path, sounding, *, found=None, seed, way=((1.0, 1.0), (5.0, 1.0), (5.0, 3.5), (1.0, 3.5))
+    path,
+    sounding,
+    *,
+    found=None,
+    seed,
+    way=((1.0, 1.0), (5.0, 1.0), (5.0, 3.5), (1.0, 3.5)),
+    room=None,
+    frame_pose=(0.0, 0.0, 0.0),
 ):
     """A run folder whose scans hold some sources (x, y, loudness), and which names some of them."""
     track = drive(way)
@@ -38,11 +48,29 @@ def folder(
     scans = heard_scans(track, sounding, seed=seed)
     images = (Reflection(2.5, -0.4, 1e-8, 0),) if named else ()
     run = replace(
-        base, trajectory=track, scans=scans, sources=SourceList(sources, scans.reference, images)
+        base,
+        room=room or base.room,
+        trajectory=replace(track, pose=relative(frame_pose, track.pose)),
+        scans=scans,
+        sources=moved(SourceList(sources, scans.reference, images), frame_pose),
     )
     path.mkdir()
     write_run(run, path, figures=PictureFormat.NONE)
     return path
+
+
+def moved(sources, pose):
+    """Sources as a frame tells of them that has a pose in that of the sources."""
+
+    def there(thing):
+        x, y = transformed(inverted(pose), (thing.x_m, thing.y_m)).tolist()
+        return replace(thing, x_m=x, y_m=y)
+
+    return replace(
+        sources,
+        sources=tuple(map(there, sources)),
+        reflections=tuple(map(there, sources.reflections)),
+    )
 
 
 def everything(factors=(1.0, 1.0, 1.0)):
@@ -105,15 +133,47 @@ def test_against_a_silent_background_all_appeared(tmp_path):
     assert differences(silent, silent) == ()
 
 
-def test_runs_in_different_maps_are_compared_with_a_note(tmp_path):
-    run = folder(tmp_path / "run", everything(), seed=1)
-    other = folder(tmp_path / "other", everything(), seed=2)
-    assert compared(run, other, CONFIG.diff, CONFIG.detect).notes == ()
-    yaml = other / "map.yaml"
-    yaml.write_text(yaml.read_text().replace("-0.5", "-0.4"))
-    (note,) = compared(run, other, CONFIG.diff, CONFIG.detect).notes
+def corner_room(pose=(0.0, 0.0, 0.0)):
+    """A room with a corner cut out, in a frame that has a pose in the room's."""
+    corners = np.array([(0, 0), (6, 0), (6, 4.5), (1.5, 4.5), (1.5, 3.7), (0, 3.7), (0, 0)])
+    steps = np.linspace(0.0, 1.0, 600)[:, None]
+    walls = np.concatenate([a + steps * (b - a) for a, b in itertools.pairwise(corners)])
+    walls = transformed(inverted(pose), walls)
+    low = walls.min(axis=0) - 0.5
+    columns, rows = np.ceil((walls.max(axis=0) + 0.5 - low) / 0.05).astype(int).tolist()
+    frame = GridFrame(0.05, (float(low[0]), float(low[1])), (rows, columns))
+    occupied = np.zeros(frame.shape, dtype=bool)
+    occupied[tuple(frame.cells(walls).T)] = True
+    return OccupancyGrid(frame, occupied, ~occupied)
+
+
+def test_runs_in_maps_of_their_own_are_laid_on_each_other(tmp_path):
+    pose = np.array([0.8, -0.5, 0.25])
+    run = folder(tmp_path / "run", everything((1.0, 1.0, 0.0)), seed=1, room=corner_room())
+    other = folder(
+        tmp_path / "other", everything(), seed=2, room=corner_room(pose), frame_pose=pose
+    )
+    comparison = compared(run, other, CONFIG.diff, CONFIG.detect)
+    (note,) = comparison.notes
     assert "different maps" in note.what
     assert not note.data_lost
+    assert kinds(comparison.ratio.changes) == ["unchanged", "unchanged", "gone"]
+    back = compared(other, run, CONFIG.diff, CONFIG.detect).ratio.changes
+    (appeared,) = (change for change in back if change.kind == ChangeKind.APPEARED)
+    place = transformed(pose, (appeared.x_m, appeared.y_m))
+    assert place == pytest.approx(PLACES[2], abs=0.06)
+
+
+def test_maps_that_do_not_match_are_told_of(tmp_path):
+    run = folder(tmp_path / "run", everything(), seed=1)
+    post = np.zeros(walled_room().frame.shape, dtype=bool)
+    post[20, 30] = True
+    other = folder(
+        tmp_path / "other", everything(), seed=2, room=replace(walled_room(), occupied=post)
+    )
+    assert compared(run, run, CONFIG.diff, CONFIG.detect).notes == ()
+    (note,) = compared(run, other, CONFIG.diff, CONFIG.detect).notes
+    assert "cannot be laid on each other" in note.what
 
 
 def test_folders_that_tell_of_no_sources_are_compared_cell_by_cell(tmp_path):

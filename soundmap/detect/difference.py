@@ -6,11 +6,11 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from soundmap.change import Change, ChangeKind
 from soundmap.detect.peaks import local_maxima
-from soundmap.geometry import FloatArray
+from soundmap.geometry import FloatArray, transformed
 from soundmap.grid import GridFrame
 from soundmap.sound import PowerMap, decibels
 
@@ -59,12 +59,16 @@ def cell_levels(power_map: PowerMap, *, min_visit_share: float) -> CellLevels:
 
 
 def power_ratio(
-    run: CellLevels, frame: GridFrame, background: CellLevels, background_frame: GridFrame
+    run: CellLevels,
+    frame: GridFrame,
+    background: CellLevels,
+    background_frame: GridFrame,
+    pose: ArrayLike = (0.0, 0.0, 0.0),
 ) -> tuple[CellLevels, NDArray[np.bool_]]:
     """Ratio of two power maps in dB, on the grid of the first.
 
-    The grids need not coincide, only the map frame they lie in: each cell is compared with the
-    background's cell that holds its centre. Where the background run measured nothing, nothing
+    The grids need not coincide: each cell is compared with the background's cell that holds its
+    centre. Where the background run measured nothing, nothing
     there was the strongest candidate of any of its scans, so the place was no louder than what
     was: the median of the background's measured cells stands in, and their scatter is its error.
     Where the run itself measured nothing, there is no ratio.
@@ -77,6 +81,8 @@ def power_ratio(
     background : CellLevels
         Of shape (H', W').
     background_frame : GridFrame
+    pose : array_like, shape (3,)
+        Of the run's map frame in that of the background [m], [rad]: nothing if both have one map.
 
     Returns
     -------
@@ -93,7 +99,7 @@ def power_ratio(
     if not len(known):
         raise ValueError("the background power map holds no measurement")
     centres = frame.centres(np.moveaxis(np.indices(frame.shape), 0, -1))
-    cells = background_frame.cells(centres)
+    cells = background_frame.cells(transformed(pose, centres))
     inside = background_frame.contains(cells)
     row, column = np.where(inside, cells[..., 0], 0), np.where(inside, cells[..., 1], 0)
 
@@ -169,12 +175,19 @@ def changed_cells(
     return tuple(changes)
 
 
-def seen_from_the_other_side(change: Change) -> Change:
-    """The change that the background run would have undergone, told of the run."""
+def seen_from_the_other_side(change: Change, pose: ArrayLike = (0.0, 0.0, 0.0)) -> Change:
+    """The change that the background run would have undergone, told of the run.
+
+    Parameters
+    ----------
+    change : Change
+    pose : array_like, shape (3,)
+        Of the background's map frame in that of the run [m], [rad].
+    """
     turned = {ChangeKind.LOUDER: ChangeKind.QUIETER, ChangeKind.APPEARED: ChangeKind.GONE}
-    return dataclasses.replace(
-        change, ratio_db=-change.ratio_db, kind=turned.get(change.kind, change.kind)
-    )
+    x, y = transformed(pose, (change.x_m, change.y_m)).tolist()
+    kind = turned.get(change.kind, change.kind)
+    return dataclasses.replace(change, x_m=x, y_m=y, ratio_db=-change.ratio_db, kind=kind)
 
 
 def family_chance(probability: float, trials: int) -> float | None:
