@@ -220,7 +220,7 @@ class SourceFit:
     covariance_m2 : ndarray, shape (2, 2)
         Of x and y [m^2].
     false_alarm_probability : float
-        That a run without any source would show as much anywhere.
+        That anything in a run would seem as much of a source by chance, or as a ghost of others.
     arc_rad : float
         Width of the arc of directions that it was heard from [rad].
     flags : tuple of str

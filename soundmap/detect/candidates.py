@@ -1,104 +1,159 @@
-"""Candidates: places where a sound may come from, on surfaces, behind them, or in the open."""
+"""Candidates: a grid of places where a sound may come from, in the room and behind its walls."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from soundmap.detect.evidence import Evidence
+from soundmap.detect.matched_filter import MatchedScans, explained
+from soundmap.detect.sound_paths import DEEPEST_M, REACH_M, Kind
 from soundmap.geometry import FloatArray
 
-HIT_CELL_M = 0.04
-"""Laser hits within such a cell are one point of a surface."""
-LEAST_HITS = 3
-SURFACE_STEP_M = 0.10
-OPEN_STEP_M = 0.25
-SURROUNDINGS_M = 2.2
-"""How far from surfaces candidates lie: mirror images of what stands 1 m off a wall are 2 m off."""
-REACH_M = 9.0
-HITS_AT_ONCE = 2000
+STEP_M = {Kind.SOURCE: 0.2, Kind.IMAGE: 0.3}
+"""Spacing of the grids [m]."""
+SCANS = 150
+"""About as many scans tell which candidates are worth a closer look."""
+FINER_M = (0.1, 0.05)
+"""Steps by which a candidate is then placed."""
+IMAGE_FACTOR = 0.7
+"""Of a source and a mirror image that explain the same, the source is taken: the image must explain
+so much more."""
 
 
-class Kind(IntEnum):
-    """Where a candidate lies as the lasers see it."""
+@dataclass(frozen=True)
+class Candidate:
+    """A place where one more source would explain much.
 
-    SURFACE = 0
-    """On a surface: a source."""
-    BEHIND = 1
-    """Behind a surface: the mirror image of a source."""
-    OPEN = 2
-    """In the open: a source that the lasers do not see."""
+    Attributes
+    ----------
+    place_m : ndarray, shape (2,)
+        [m]
+    kind : Kind
+    value : float
+        Misfit that it would explain, times `IMAGE_FACTOR` for images.
+    """
+
+    place_m: FloatArray
+    kind: Kind
+    value: float
 
 
 @dataclass(frozen=True)
 class Candidates:
-    """Where sound may come from.
+    """The places that enough scans could tell of.
 
     Attributes
     ----------
-    surface_m : ndarray, shape (H, 2)
-        Points of the surfaces, each the mean of the laser hits in a cell [m].
-    place_m : ndarray, shape (C, 2)
-        Candidates in the map frame [m].
-    kind : ndarray of int, shape (C,)
-        `Kind` of each; those on surfaces come first.
+    source_m, image_m : ndarray, shape (C, 2)
+        Those of each kind, in the map frame [m].
     """
 
-    surface_m: FloatArray
-    place_m: FloatArray
-    kind: NDArray[np.int64]
+    source_m: FloatArray
+    image_m: FloatArray
+
+    def places_m(self, kind: Kind) -> FloatArray:
+        """Those of a kind, shape (C, 2) [m]."""
+        return self.image_m if kind == Kind.IMAGE else self.source_m
 
 
-def candidate_places(evidence: Evidence) -> Candidates:
-    """Candidates around all that the lasers saw during the run."""
-    from scipy.spatial import cKDTree
+def candidate_places(evidence: Evidence, surface_m: FloatArray) -> Candidates:
+    """A grid over all that was within reach, as far as enough scans could tell of it.
 
-    surface = _surface_points(evidence)
-    if not len(surface):
-        return Candidates(surface, surface, np.empty(0, dtype=np.int64))
-    cells = np.floor(surface / SURFACE_STEP_M).astype(np.int64)
-    _, first = np.unique(cells, axis=0, return_index=True)
-    on = surface[np.sort(first)]
-    low, high = surface.min(axis=0) - SURROUNDINGS_M, surface.max(axis=0) + SURROUNDINGS_M
-    x, y = np.meshgrid(*(np.arange(a, b, OPEN_STEP_M) for a, b in zip(low, high, strict=True)))
-    around = np.stack([x.ravel(), y.ravel()], axis=-1)
-    distance, _ = cKDTree(surface).query(around, distance_upper_bound=SURROUNDINGS_M)
-    off = around[np.isfinite(distance) & (distance > 0.15)]
-    kinds = [(Kind.SURFACE, len(on)), (Kind.BEHIND, len(off)), (Kind.OPEN, len(off))]
-    kind = np.concatenate([np.full(count, int(each), dtype=np.int64) for each, count in kinds])
-    return Candidates(surface, np.concatenate([on, off, off]), kind)
+    Parameters
+    ----------
+    evidence : Evidence
+    surface_m : ndarray, shape (H, 2)
+        Points of the surfaces that lasers saw [m]; may be none.
+    """
+    seen_m = np.concatenate([surface_m, evidence.place_m])
+    margin = DEEPEST_M if len(surface_m) else REACH_M / 2.0
+    low, high = seen_m.min(axis=0) - margin, seen_m.max(axis=0) + margin
+    scans, bands = len(evidence), evidence.sub_bands
+    classes, waves = evidence.table.beams.shape[:2]
+    same = np.ones((1, 1, 1, 1), dtype=np.float32)
+    anything = MatchedScans(
+        np.broadcast_to(same, (scans, bands, classes, waves)).copy(),
+        np.broadcast_to(same, (scans, bands, 2, waves // 3)).copy(),
+    )
+    places = []
+    for kind in (Kind.SOURCE, Kind.IMAGE):
+        axes = (np.arange(a, b, STEP_M[kind]) for a, b in zip(low, high, strict=True))
+        x, y = np.meshgrid(*axes)
+        grid = np.stack([x.ravel(), y.ravel()], axis=-1)
+        places.append(grid[explained(evidence, anything, grid, kind).max(axis=1) > 0.0])
+    return Candidates(*places)
 
 
-def _surface_points(evidence: Evidence) -> FloatArray:
-    """Means of the laser hits in each cell that was hit often enough."""
-    bearings = evidence.range_m.shape[1]
-    turn = evidence.handedness * 2.0 * np.pi * np.arange(bearings) / bearings
-    cells: dict[tuple[int, int], list[float]] = {}
-    for start in range(0, len(evidence), HITS_AT_ONCE):
-        part = slice(start, start + HITS_AT_ONCE)
-        distance = evidence.range_m[part].astype(np.float64)
-        angle = evidence.axis_rad[part, None] + turn
-        x = evidence.place_m[part, :1] + distance * np.cos(angle)
-        y = evidence.place_m[part, 1:] + distance * np.sin(angle)
-        near = np.isfinite(distance) & (distance < REACH_M)
-        hits = np.stack([x[near], y[near]], axis=-1)
-        key, index, count = np.unique(
-            np.floor(hits / HIT_CELL_M).astype(np.int64),
-            axis=0,
-            return_inverse=True,
-            return_counts=True,
+def best_candidates(
+    evidence: Evidence,
+    matched: MatchedScans,
+    candidates: Candidates,
+    *,
+    least: float,
+    least_share: float,
+    apart_m: float,
+    most: int,
+) -> list[Candidate]:
+    """The candidates that explain most and lie well apart, each placed more finely.
+
+    Parameters
+    ----------
+    evidence : Evidence
+    matched : MatchedScans
+    candidates : Candidates
+    least, least_share : float
+        Least that a candidate has to explain, and least share of what the best near it explains.
+    apart_m : float
+        Least distance between them [m].
+    most : int
+        How many at most.
+    """
+    places, kinds, values = [], [], []
+    stride = max(len(evidence) // SCANS, 1)
+    few = np.arange(0, len(evidence), stride)
+    some, looked_at = evidence.chosen(few), MatchedScans(matched.match[few], matched.energy[few])
+    for kind, factor in ((Kind.SOURCE, 1.0), (Kind.IMAGE, IMAGE_FACTOR)):
+        own = candidates.places_m(kind)
+        value = explained(some, looked_at, own, kind).max(axis=1, initial=0.0)
+        value *= factor * stride
+        loud = value >= least
+        places.append(own[loud])
+        values.append(value[loud])
+        kinds.append(np.full(int(loud.sum()), int(kind)))
+    place, value, kind_of = np.concatenate(places), np.concatenate(values), np.concatenate(kinds)
+    chosen: list[int] = []
+    for index in _falling(value):
+        away = np.hypot(*(place[chosen] - place[index]).T) if chosen else np.empty(0)
+        best_near = value[[c for c, d in zip(chosen, away, strict=True) if d < REACH_M]]
+        if np.any(away < apart_m) or np.any(value[index] < least_share * best_near):
+            continue
+        chosen.append(int(index))
+        if len(chosen) == most:
+            break
+    return [
+        Candidate(
+            finer_place(evidence, matched, place[index], Kind(int(kind_of[index]))),
+            Kind(int(kind_of[index])),
+            float(value[index]),
         )
-        index = index.ravel()
-        sums = np.stack([np.bincount(index, hits[:, i], len(key)) for i in (0, 1)], axis=-1)
-        for (column, row), (sum_x, sum_y), hit in zip(key, sums, count, strict=True):
-            total = cells.setdefault((int(column), int(row)), [0.0, 0.0, 0.0])
-            total[0] += sum_x
-            total[1] += sum_y
-            total[2] += hit
-    points = np.array(list(cells.values())).reshape(-1, 3)
-    points = points[points[:, 2] >= LEAST_HITS]
-    points = points[np.lexsort((points[:, 1] / points[:, 2], points[:, 0] / points[:, 2]))]
-    return np.asarray(points[:, :2] / points[:, 2:])
+        for index in chosen
+    ]
+
+
+def finer_place(
+    evidence: Evidence, matched: MatchedScans, place_m: FloatArray, kind: Kind
+) -> FloatArray:
+    """The best place near one of the grid [m]."""
+    for step in FINER_M:
+        offset = step * np.arange(-2, 3)
+        around = place_m + np.stack(np.meshgrid(offset, offset), axis=-1).reshape(-1, 2)
+        value = explained(evidence, matched, around, kind).max(axis=1)
+        place_m = around[int(np.argmax(value))]
+    return place_m
+
+
+def _falling(values: FloatArray) -> NDArray[np.intp]:
+    return np.argsort(-values, kind="stable")

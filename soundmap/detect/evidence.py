@@ -7,23 +7,24 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from soundmap.beam import beam_patterns, turned_beam_patterns
 from soundmap.config import ScanConfig
+from soundmap.detect.harmonics import BeamTable, Single, beam_table
 from soundmap.geometry import FloatArray, Trajectory, transformed, wrapped_angle
 from soundmap.sensors import MicArray
 from soundmap.sound import AudioScans
 
-SLOPES_DB_PER_OCTAVE = (-14.0, -7.0, 0.0, 8.0)
-"""Spectral slopes whose beams stand for those of all sounds."""
-TURN_STEP_RAD = np.radians(0.5)
-GREATEST_TURN_RAD = np.radians(10.0)
+RELATIVE_NOISE = 0.28
+"""Standard deviation of what no source explains in a scan, over the scan's mean power: chance of
+averaging few frames, and sound that interferes with its own reflections."""
 REST_M, REST_RAD = 0.04, 0.02
-"""Scans taken nearer to each other than this are one."""
+"""Consecutive scans taken nearer to each other than this are one."""
 MOST_MERGED = 20
 LARGEST_WEIGHT = 4.0
 """However long the robot rests, a place counts no more than this many scans."""
-
-Single = NDArray[np.float32]
+MOST_SCANS = 1200
+"""In longer runs, scans from nearly the same pose are one whenever they were taken."""
+SAME_M, SAME_RAD = 0.12, np.radians(10.0)
+MOST_TURN_RAD = np.radians(12.0)
 
 
 @dataclass(frozen=True)
@@ -38,32 +39,54 @@ class Evidence:
         Direction of the array's x axis in the map frame [rad].
     handedness : int
         -1 if the array hangs upside down: its bearings then run clockwise in the map.
-    heard : ndarray of float32, shape (S, N)
-        :math:`J_n` less its mean over the bearings, times `weight`.
-    weight : ndarray, shape (S,)
-        One over the scan's mean power, so that a near pass does not outvote the rest.
+    height_m : float
+        Of the array over the origin of the base, which is on the floor [m].
+    turn_rad : ndarray, shape (S,)
+        How far the array turned during the scan [rad], >= 0.
     merged : ndarray of int, shape (S,)
         Audio scans behind each.
     range_m : ndarray of float32, shape (S, M)
         To the first surface on M bearings of the array [m]; NaN where unknown.
-    turn_class : ndarray of int, shape (S,)
-        Index of the beams that fit the array's turn during the scan.
-    beams : ndarray of float32, shape (slopes, turns, M, N)
-        Response less its mean over the bearings.
+    heard : ndarray of float32, shape (S, D)
+        Evened-out harmonics of :math:`J_n`, times `weight`: in units of the noise.
+    weight : ndarray, shape (S, B)
+        One over the noise of each sub-band.
+    table : BeamTable
     """
 
     place_m: FloatArray
     axis_rad: FloatArray
     handedness: int
-    heard: Single
-    weight: FloatArray
+    height_m: float
+    turn_rad: FloatArray
     merged: NDArray[np.int64]
     range_m: Single
-    turn_class: NDArray[np.int64]
-    beams: Single
+    heard: Single
+    weight: FloatArray
+    table: BeamTable
 
     def __len__(self) -> int:
         return len(self.place_m)
+
+    @property
+    def sub_bands(self) -> int:
+        """B, parts of the band that are told apart."""
+        return self.weight.shape[1]
+
+    def chosen(self, scans: NDArray[np.int64]) -> Evidence:
+        """Some of the scans."""
+        return Evidence(
+            self.place_m[scans],
+            self.axis_rad[scans],
+            self.handedness,
+            self.height_m,
+            self.turn_rad[scans],
+            self.merged[scans],
+            self.range_m[scans],
+            self.heard[scans],
+            self.weight[scans],
+            self.table,
+        )
 
 
 def gathered_evidence(
@@ -73,10 +96,10 @@ def gathered_evidence(
     array: MicArray,
     config: ScanConfig,
 ) -> Evidence:
-    """The scans with a trusted pose, those at rest merged.
+    """The scans with a trusted pose, those from the same pose merged.
 
-    Diffuse sound is the same on all bearings of an even array: the mean over the bearings is
-    taken from data and model alike.
+    Diffuse sound is the same on all bearings of an even array: the mean over the bearings tells
+    nothing of places and is left out.
 
     Parameters
     ----------
@@ -87,71 +110,83 @@ def gathered_evidence(
     array : MicArray
     config : ScanConfig
     """
+    parts, edges_hz = scans.sub_bands, scans.sub_band_hz
+    if parts is None:
+        parts, edges_hz = scans.power[:, None], (config.low_hz, config.high_hz)
     half_ns = round(0.5 * (config.frames - 1) * config.hop_s * 1e9)
     offsets = np.linspace(-half_ns, half_ns, max(config.frames, 2)).astype(np.int64)
     poses = trajectory.at(scans.time_ns[:, None] + offsets)
     trusted = trajectory.usable_at(scans.time_ns) & np.isfinite(poses).all(axis=(1, 2))
-    trusted &= np.isfinite(scans.power).all(axis=1) & (scans.power.mean(axis=1) > 0.0)
+    trusted &= np.isfinite(parts).all(axis=(1, 2)) & (parts.mean(axis=2) > 0.0).all(axis=1)
     chosen = np.flatnonzero(trusted)
     poses = poses[chosen]
     turns = np.unwrap(poses[:, :, 2], axis=1)
-    pose = np.column_stack([poses[:, :, :2].mean(axis=1), turns.mean(axis=1)])
     frames = len(offsets)
     turn = np.abs(turns[:, -1] - turns[:, 0]) * frames / (frames - 1)
-    turn_class = np.rint(np.minimum(turn, GREATEST_TURN_RAD) / TURN_STEP_RAD).astype(np.int64)
-    starts = _rests(pose)
-    count = np.diff(np.append(starts, len(pose)))
-    power = _means(scans.power[chosen].astype(np.float64), starts, count)
-    weight = np.sqrt(np.minimum(count, LARGEST_WEIGHT)) / power.mean(axis=1)
-    heard = (power - power.mean(axis=1, keepdims=True)) * weight[:, None]
-    pose = np.column_stack([_means(pose[:, :2], starts, count), pose[starts, 2]])
+    heading = turns.mean(axis=1)
+    base = np.column_stack([poses[:, :, :2].mean(axis=1), heading])
     mount = array.mount
+    place = transformed(base, np.broadcast_to(mount.translation_m[:2], (len(base), 2)))
+    axis = np.asarray(wrapped_angle(heading + mount.yaw_rad))
+    group = _rests(place, axis)
+    if len(group) and group[-1] >= MOST_SCANS:
+        group = _same_poses(place, axis)
+    first, count = _firsts(group)
+    mean = parts[chosen].mean(axis=2, dtype=np.float64)
+    table = beam_table(
+        array,
+        edges_hz,
+        bearings=scans.power.shape[1],
+        waves=range_m.shape[1],
+        speed_of_sound_m_s=config.speed_of_sound_m_s,
+    )
+    heard = _means(table.harmonics(parts[chosen]), group, count)
+    weight = np.sqrt(np.minimum(count, LARGEST_WEIGHT))[:, None]
+    weight = weight / (RELATIVE_NOISE * _means(mean, group, count))
     return Evidence(
-        transformed(pose, np.broadcast_to(mount.translation_m[:2], (len(pose), 2))),
-        np.asarray(wrapped_angle(pose[:, 2] + mount.yaw_rad)),
+        _means(place, group, count),
+        axis[first] + _means(wrapped_angle(axis - axis[first][group]), group, count),
         mount.handedness,
-        heard.astype(np.float32),
+        float(mount.translation_m[2]),
+        np.minimum(turn[first], MOST_TURN_RAD),
+        count,
+        range_m[chosen][first],
+        (heard * weight[:, table.part]).astype(np.float32),
         weight,
-        count.astype(np.int64),
-        range_m[chosen][starts],
-        turn_class[starts],
-        _beams(array.positions_m, scans.power.shape[1], range_m.shape[1], config),
+        table,
     )
 
 
-def _rests(pose: FloatArray) -> NDArray[np.int64]:
-    """First scan of each stretch that was taken from one place."""
-    starts: list[int] = []
-    for index, (x, y, heading) in enumerate(pose):
-        if starts and index - starts[-1] < MOST_MERGED:
-            there = pose[starts[-1]]
-            moved = np.hypot(x - there[0], y - there[1])
-            if moved < REST_M and abs(wrapped_angle(heading - there[2])) < REST_RAD:
-                continue
-        starts.append(index)
-    return np.array(starts, dtype=np.int64)
+def _rests(place_m: FloatArray, axis_rad: FloatArray) -> NDArray[np.int64]:
+    """For each scan the stretch of scans taken from one pose that it belongs to."""
+    group = np.zeros(len(place_m), dtype=np.int64)
+    start = 0
+    for index in range(1, len(place_m)):
+        moved = np.hypot(*(place_m[index] - place_m[start]))
+        turned = abs(wrapped_angle(axis_rad[index] - axis_rad[start]))
+        same = moved < REST_M and turned < REST_RAD and index - start < MOST_MERGED
+        group[index] = group[index - 1] + (not same)
+        start = start if same else index
+    return group
 
 
-def _means(values: FloatArray, starts: NDArray[np.int64], count: NDArray[np.int64]) -> FloatArray:
-    if not len(starts):
-        return values[:0]
-    return np.asarray(np.add.reduceat(values, starts, axis=0) / count[:, None])
+def _same_poses(place_m: FloatArray, axis_rad: FloatArray) -> NDArray[np.int64]:
+    """For each scan its pose, of those that were taken, in the order in which they came up."""
+    cell = np.column_stack(
+        [np.floor(place_m / SAME_M), np.floor(np.asarray(wrapped_angle(axis_rad)) / SAME_RAD)]
+    )
+    _, first, index = np.unique(cell, axis=0, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[index.ravel()].astype(np.int64)
 
 
-def _beams(positions_m: FloatArray, bearings: int, waves: int, config: ScanConfig) -> Single:
-    turns = np.arange(0.0, GREATEST_TURN_RAD + 0.5 * TURN_STEP_RAD, TURN_STEP_RAD)
-    beams = np.empty((len(SLOPES_DB_PER_OCTAVE), len(turns), waves, bearings), dtype=np.float32)
-    for index, slope in enumerate(SLOPES_DB_PER_OCTAVE):
-        at_rest = beam_patterns(
-            positions_m,
-            bearings=bearings,
-            waves=waves,
-            low_hz=config.low_hz,
-            high_hz=config.high_hz,
-            slope_db_per_octave=slope,
-            speed_of_sound_m_s=config.speed_of_sound_m_s,
-        )
-        at_rest -= at_rest.mean(axis=1, keepdims=True)
-        for turn_class, turn in enumerate(turns):
-            beams[index, turn_class] = turned_beam_patterns(at_rest, float(turn))
-    return beams
+def _firsts(group: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First member and size of each group."""
+    _, first, count = np.unique(group, return_index=True, return_counts=True)
+    return first.astype(np.int64), count.astype(np.int64)
+
+
+def _means(values: FloatArray, group: NDArray[np.int64], count: NDArray[np.int64]) -> FloatArray:
+    """Mean of the values (K, ...) of each group."""
+    total = np.zeros((len(count), *values.shape[1:]))
+    np.add.at(total, group, values)
+    return np.asarray(total / count.reshape(-1, *[1] * (values.ndim - 1)))

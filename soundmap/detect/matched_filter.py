@@ -1,59 +1,171 @@
-r"""Matched filter: how well a source at a place would explain what all scans have heard.
+r"""Matched filter: how much of what the fit leaves over one more source would explain.
 
-A source of mean square q at 1 m adds to scan s, on bearing n,
+With the residual r of a scan, the covariance :math:`\Sigma` of noise and model errors and the beam
+b of a wave from some direction, a source of unknown spectrum that is heard with gain g explains
 
-.. math:: q \, B(\theta_n, \phi_s) / (\max(r_s, 0.4\,\mathrm{m})^2 + h^2),
+.. math:: \sum_B \frac{\max(0, \sum_s g_s \, b_s^T \Sigma_s^{-1} r_s)^2}
+                       {\sum_s g_s^2 \, b_s^T \Sigma_s^{-1} b_s}
 
-if the lasers let it be seen from there: B is the beam, :math:`\phi_s` and :math:`r_s` bearing and
-distance of the source, h the height between it and the array.
+of the misfit, summed over sub-bands B. Both products are worked out once for all directions around
+each scan; a place then takes one look into them a scan.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit, prange
-from numpy.typing import NDArray
 
-from soundmap.detect.candidates import REACH_M, Kind
-from soundmap.detect.evidence import Evidence, Single
+from soundmap.detect.evidence import Evidence
+from soundmap.detect.harmonics import APERTURES, Single
+from soundmap.detect.model_errors import Precision
+from soundmap.detect.sound_paths import NEAREST_M, REACH_M, Kind, seen
 from soundmap.geometry import FloatArray
 
-HEIGHT_M = 0.3
-"""Height between source and array that is assumed [m]."""
-NEAREST_M = 0.4
-ON_SURFACE_M, ON_SURFACE_PER_M = 0.22, 0.03
-"""What is on a surface lies within this distance of the laser hit on its bearing [m] [m/m]."""
-FARTHEST_BEHIND_M = 2.6
-IN_FRONT_M = 0.35
-"""What is in the open lies no more than this behind the laser hit on its bearing [m]."""
-LEAST_SCANS = 4.0
+HEIGHTS_M = np.array([0.2, 0.6])
+"""Heights between array and source that are tried [m]."""
+CLASSES = np.array([0, 4])
+"""Apertures at which energies are worked out."""
+COARSE = 3
+"""Directions between those at which energies are worked out."""
+LEAST_SCANS = 8.0
 """A place that fewer scans (effective number) tell of is no candidate."""
+MANY = 1000
+"""Places from which on the work is shared among cores; for fewer the sharing costs more."""
 
 
-@njit(cache=True, nogil=True)
-def _gain(distance: float, surface: float, kind: int) -> float:
-    if kind != 2 and np.isnan(surface):
-        return 0.0
-    beyond = distance - surface
-    if kind == 0 and abs(beyond) > ON_SURFACE_M + ON_SURFACE_PER_M * distance:
-        return 0.0
-    if kind == 1 and (beyond > FARTHEST_BEHIND_M or beyond < 0.0):
-        return 0.0
-    if kind == 2 and beyond > IN_FRONT_M:
-        return 0.0
-    near = max(distance, NEAREST_M)
-    return 1.0 / (near * near + HEIGHT_M * HEIGHT_M)
+@dataclass(frozen=True)
+class MatchedScans:
+    """Products of each scan with the beams all around.
+
+    Attributes
+    ----------
+    match : ndarray of float32, shape (S, B, E, M)
+        Of the residual.
+    energy : ndarray of float32, shape (S, B, len(CLASSES), M / COARSE)
+        Of the beams themselves.
+    """
+
+    match: Single
+    energy: Single
 
 
-@njit(cache=True, nogil=True)
-def _gains(distance: FloatArray, surface: FloatArray, kind: int) -> FloatArray:
-    gain = np.zeros(len(distance))
-    for s in range(len(distance)):
-        if distance[s] < REACH_M:
-            gain[s] = _gain(distance[s], surface[s], kind)
-    return gain
+def matched_scans(evidence: Evidence, residual: Single, precision: Precision) -> MatchedScans:
+    """Products of a residual (S, D) with all beams."""
+    beams, starts = evidence.table.beams, evidence.table.starts
+    apertures, waves, _ = beams.shape
+    scans, bands = len(evidence), evidence.sub_bands
+    weighted = precision.times(residual)
+    match = np.empty((scans, bands, apertures, waves), dtype=np.float32)
+    energy = np.empty((scans, bands, len(CLASSES), waves // COARSE), dtype=np.float32)
+    for band, inverse in enumerate(precision.inverse):
+        own = slice(starts[band], starts[band + 1])
+        beam = beams[:, :, own]
+        match[:, band] = (weighted[:, own] @ beam.reshape(apertures * waves, -1).T).reshape(
+            scans, apertures, waves
+        )
+        for index, aperture in enumerate(CLASSES):
+            few = np.ascontiguousarray(beam[aperture, : waves // COARSE * COARSE : COARSE])
+            energy[:, band, index] = np.einsum("smd,md->sm", np.matmul(few, inverse), few)
+    return MatchedScans(match, energy)
+
+
+def explained(
+    evidence: Evidence, matched: MatchedScans, places_m: FloatArray, kind: Kind
+) -> FloatArray:
+    """Misfit that one source at each place would explain, shape (C, heights).
+
+    Parameters
+    ----------
+    evidence : Evidence
+    matched : MatchedScans
+    places_m : ndarray, shape (C, 2)
+        [m]
+    kind : Kind
+    """
+    run = _explained_by_many if len(places_m) >= MANY else _explained_by_few
+    return np.asarray(
+        run(
+            np.ascontiguousarray(places_m, dtype=np.float64),
+            HEIGHTS_M,
+            kind == Kind.IMAGE,
+            evidence.place_m,
+            evidence.axis_rad,
+            float(evidence.handedness),
+            evidence.range_m,
+            evidence.weight,
+            matched.match,
+            matched.energy,
+            APERTURES,
+        )
+    )
+
+
+def _explained(
+    places: FloatArray,
+    heights: FloatArray,
+    behind: bool,
+    stand: FloatArray,
+    axis: FloatArray,
+    hand: float,
+    ranges: Single,
+    weight: FloatArray,
+    match: Single,
+    energy: Single,
+    apertures: FloatArray,
+) -> FloatArray:
+    scans, bands, classes, waves = match.shape
+    explained = np.zeros((len(places), len(heights)))
+    for c in prange(len(places)):
+        product = np.zeros((len(heights), bands))
+        square = np.zeros((len(heights), bands))
+        told, told_twice = np.zeros(len(heights)), np.zeros(len(heights))
+        for s in range(scans):
+            dx, dy = places[c, 0] - stand[s, 0], places[c, 1] - stand[s, 1]
+            square_m = dx * dx + dy * dy
+            if square_m > REACH_M * REACH_M:
+                continue
+            turn = hand * (fast_arctan2(dy, dx) - axis[s]) / (2.0 * np.pi)
+            at = (turn - np.floor(turn)) * waves
+            left = int(at)
+            share = at - left
+            left %= waves
+            right = (left + 1) % waves
+            distance = np.sqrt(square_m)
+            beyond = distance - ranges[s, left if share < 0.5 else right]
+            if not seen(distance, beyond, behind):
+                continue
+            near = max(distance, NEAREST_M)
+            coarse = int(at / COARSE + 0.5) % energy.shape[3]
+            for h in range(len(heights)):
+                away = near * near + heights[h] * heights[h]
+                aperture = near / np.sqrt(away)
+                e = 0
+                while e < classes - 1 and 0.5 * (apertures[e] + apertures[e + 1]) > aperture:
+                    e += 1
+                total = 0.0
+                for b in range(bands):
+                    gain = weight[s, b] / away
+                    between = (1.0 - share) * match[s, b, e, left] + share * match[s, b, e, right]
+                    own = gain * gain * energy[s, b, 0 if e < 3 else 1, coarse]
+                    product[h, b] += gain * between
+                    square[h, b] += own
+                    total += own
+                told[h] += total
+                told_twice[h] += total * total
+        for h in range(len(heights)):
+            if told[h] * told[h] > LEAST_SCANS * told_twice[h]:
+                for b in range(bands):
+                    if product[h, b] > 0.0 and square[h, b] > 0.0:
+                        explained[c, h] += product[h, b] * product[h, b] / square[h, b]
+    return explained
+
+
+def effective_number(gain: FloatArray) -> float:
+    """How many scans tell of a source that they hear with these gains."""
+    square = gain**2
+    return float(square.sum() ** 2 / max(np.sum(square**2), 1e-300))
 
 
 @njit(cache=True, nogil=True)
@@ -75,152 +187,5 @@ def fast_arctan2(y: float, x: float) -> float:
     return angle
 
 
-def _explained(
-    places: FloatArray,
-    kinds: NDArray[np.int64],
-    stand: FloatArray,
-    axis: FloatArray,
-    hand: float,
-    ranges: Single,
-    weight: FloatArray,
-    matched: Single,
-    energy: FloatArray,
-) -> FloatArray:
-    slopes, waves = len(matched), ranges.shape[1]
-    explained = np.zeros((slopes, len(places)))
-    for c in prange(len(places)):
-        match, square, fourth = np.zeros(slopes), np.zeros(slopes), np.zeros(slopes)
-        for s in range(len(stand)):
-            dx, dy = places[c, 0] - stand[s, 0], places[c, 1] - stand[s, 1]
-            square_m = dx * dx + dy * dy
-            if square_m > REACH_M * REACH_M:
-                continue
-            turn = hand * (fast_arctan2(dy, dx) - axis[s]) / (2.0 * np.pi)
-            at = (turn - np.floor(turn)) * waves
-            left = int(at)
-            share = at - left
-            left %= waves
-            right = (left + 1) % waves
-            surface = ranges[s, left if share < 0.5 else right]
-            gain = weight[s] * _gain(np.sqrt(square_m), surface, kinds[c])
-            if gain > 0.0:
-                for k in range(slopes):
-                    between = (1.0 - share) * matched[k, s, left] + share * matched[k, s, right]
-                    match[k] += gain * between
-                    part = gain * gain * energy[k, s]
-                    square[k] += part
-                    fourth[k] += part * part
-        for k in range(slopes):
-            if match[k] > 0.0 and square[k] * square[k] > LEAST_SCANS * fourth[k]:
-                explained[k, c] = match[k] * match[k] / square[k]
-    return explained
-
-
 _explained_by_few = njit(cache=True, nogil=True)(_explained)
 _explained_by_many = njit(cache=True, nogil=True, parallel=True)(_explained)
-MANY = 1000
-"""Places from which on the work is shared among cores; for fewer the sharing costs more."""
-
-
-def matched_scans(evidence: Evidence, residual: Single, slope: int) -> Single:
-    """Product of each scan with the beam toward each direction, shape (S, M)."""
-    matched = np.empty((len(evidence), evidence.beams.shape[2]), dtype=np.float32)
-    for turn_class in np.unique(evidence.turn_class):
-        chosen = evidence.turn_class == turn_class
-        matched[chosen] = residual[chosen] @ evidence.beams[slope, turn_class].T
-    return matched
-
-
-def explained_energy(
-    evidence: Evidence,
-    residual: Single,
-    slopes: Sequence[int],
-    places_m: FloatArray,
-    kinds: NDArray[np.int64],
-) -> FloatArray:
-    """Energy of the residual that one source at each place would explain, shape (slopes, C).
-
-    Parameters
-    ----------
-    evidence : Evidence
-    residual : ndarray, shape (S, N)
-    slopes : sequence of int
-        Indices of the beams.
-    places_m : ndarray, shape (C, 2)
-    kinds : ndarray of int, shape (C,)
-        `Kind` of each place.
-    """
-    matched = np.stack([matched_scans(evidence, residual, slope) for slope in slopes])
-    return _explained_by(evidence, matched, slopes, places_m, kinds)
-
-
-def heard_enough(
-    evidence: Evidence, places_m: FloatArray, kinds: NDArray[np.int64]
-) -> NDArray[np.bool_]:
-    """Whether enough scans could tell of a source at each place, shape (C,)."""
-    everything = np.ones((1, *evidence.range_m.shape), dtype=np.float32)
-    return np.asarray(_explained_by(evidence, everything, [0], places_m, kinds)[0] > 0.0)
-
-
-def _explained_by(
-    evidence: Evidence,
-    matched: Single,
-    slopes: Sequence[int],
-    places_m: FloatArray,
-    kinds: NDArray[np.int64],
-) -> FloatArray:
-    energy = (evidence.beams[list(slopes), :, 0].astype(np.float64) ** 2).sum(axis=2)
-    explained = _explained_by_many if len(places_m) >= MANY else _explained_by_few
-    return np.asarray(
-        explained(
-            np.ascontiguousarray(places_m, dtype=np.float64),
-            np.ascontiguousarray(kinds, dtype=np.int64),
-            evidence.place_m,
-            evidence.axis_rad,
-            float(evidence.handedness),
-            evidence.range_m,
-            evidence.weight,
-            matched,
-            np.ascontiguousarray(energy[:, evidence.turn_class]),
-        )
-    )
-
-
-def seen_from(
-    evidence: Evidence, place_m: FloatArray, kind: Kind
-) -> tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]:
-    """The scans that hear a place.
-
-    Returns
-    -------
-    scans : ndarray of int, shape (V,)
-    wave : ndarray, shape (V,)
-        Bearing of the place in steps of the beams' directions.
-    gain : ndarray, shape (V,)
-        Received for emitted power, 1 at 1 m.
-    beyond_m : ndarray, shape (V,)
-        How far behind the first surface on its bearing it lies [m].
-    """
-    step = place_m - evidence.place_m
-    distance = np.hypot(step[:, 0], step[:, 1])
-    waves = evidence.range_m.shape[1]
-    turn = evidence.handedness * (np.arctan2(step[:, 1], step[:, 0]) - evidence.axis_rad)
-    wave = (turn / (2.0 * np.pi)) % 1.0 * waves
-    nearest = np.rint(wave).astype(np.int64) % waves
-    surface = evidence.range_m[np.arange(len(evidence)), nearest].astype(np.float64)
-    gain = _gains(distance, surface, int(kind))
-    scans = np.flatnonzero(gain > 0.0)
-    return scans, wave[scans], gain[scans], (distance - surface)[scans]
-
-
-def column(
-    evidence: Evidence, scans: NDArray[np.int64], wave: FloatArray, gain: FloatArray, slope: int
-) -> Single:
-    """What a source of power 1 at 1 m adds to the scans that hear it, shape (V, N)."""
-    waves = evidence.beams.shape[2]
-    left = wave.astype(np.int64) % waves
-    share = (wave - np.floor(wave)).astype(np.float32)[:, None]
-    turn = evidence.turn_class[scans]
-    beams = evidence.beams[slope]
-    beam = (1.0 - share) * beams[turn, left] + share * beams[turn, (left + 1) % waves]
-    return np.asarray((evidence.weight[scans] * gain).astype(np.float32)[:, None] * beam)

@@ -42,7 +42,7 @@ SLOPE_DB_PER_OCTAVE = -6.0
 APART_M = 0.25
 """Mirror images nearer than this to a source or to each other are not told from it."""
 DECIBELS_PER_SHARE = 10.0 / np.log(10.0)
-WAVES = 360
+WAVES, FREQUENCIES = 360, 32
 CHUNK = 2000
 
 
@@ -168,13 +168,14 @@ def _stretches(trajectory: Trajectory, time_ns: NDArray[np.int64]) -> NDArray[np
 
 def _beams(positions_m: FloatArray, bearings: int, config: ScanConfig) -> FloatArray:
     """Response to a wave from each direction, less its mean over the bearings, shape (M, N)."""
+    frequency = np.linspace(config.low_hz, config.high_hz, FREQUENCIES)
+    octaves = np.log2(frequency / config.low_hz)
     beams = beam_patterns(
         positions_m,
         bearings=bearings,
         waves=WAVES,
-        low_hz=config.low_hz,
-        high_hz=config.high_hz,
-        slope_db_per_octave=SLOPE_DB_PER_OCTAVE,
+        frequency_hz=frequency,
+        share=10.0 ** (SLOPE_DB_PER_OCTAVE * octaves / 10.0),
         speed_of_sound_m_s=config.speed_of_sound_m_s,
     )
     return beams - beams.mean(axis=1, keepdims=True)

@@ -1,67 +1,80 @@
 r"""Sparse fit: the few places whose sounds together explain what all scans have heard.
 
-.. math:: J_s(\theta_n) = b_s + \sum_k a_{k,s} B(\theta_n, \phi_{k,s}) / (r_{k,s}^2 + h^2)
+.. math:: y_s = \sum_k q_k \, a_{k,s} + e_s, \quad e_s \sim N(0, \Sigma_s)
 
-Components are added one at a time, the best candidate first; after each, the places of all are
-improved and their strengths fitted anew. The strength of a component may vary slowly along the
-way, held to its mean: this takes up what the model leaves out (directivity, floor and ceiling, a
-sound that comes and goes), which otherwise would gather in ghosts.
+y are the evened-out harmonics of a scan, a what a source of strength 1 adds to them along all its
+paths, q its strength in each sub-band, and :math:`\Sigma` the covariance of noise and model errors.
+Strengths are those of generalised least squares, not negative. Places move by their bearings alone:
+how strengths change along the way is the business of reflections and directivity as much as of
+distance, and would pull them off.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from soundmap.detect.candidates import Candidates, Kind
-from soundmap.detect.evidence import SLOPES_DB_PER_OCTAVE, Evidence, Single
-from soundmap.detect.matched_filter import column, explained_energy, seen_from
+from soundmap.detect.evidence import Evidence
+from soundmap.detect.harmonics import Single
+from soundmap.detect.model_errors import Precision, bearing_derivative
+from soundmap.detect.sound_paths import NEAREST_M, Kind, Path, Paths, sound_paths, waves_heard
 from soundmap.geometry import FloatArray
 
-STRETCH = 8
-"""Scans along the way that share one strength of each component."""
-STIFFNESS = 0.9
-"""How firmly strengths are held to their mean, in units of a stretch's mean evidence."""
-LEAST_STRENGTH, GREATEST_STRENGTH = 0.2, 4.0
-"""Strength of a stretch over the mean strength: what directivity and gaps may do."""
-ROUNDS = 4
-KIND_FACTOR = {Kind.SURFACE: 1.0, Kind.BEHIND: 0.9, Kind.OPEN: 0.6}
-"""Of two kinds that explain the same, the one with the larger factor is taken."""
-BACK_TO_SURFACE = {Kind.BEHIND: 0.97, Kind.OPEN: 0.8}
-"""A component moves to a surface that explains at least this share of what it explains."""
-FIRST_SLOPES = (1, 3)
+BEHIND_M = 0.8
+"""A wall no farther from a source than this may reflect a share of its own of that source's sound:
+cabinets radiate little to their backs."""
+LEAST_SHARE, GREATEST_SHARE = 0.0, 1.0
+HOLD = 100.0
+"""How firmly a place is held where it is while it moves [1/m^2]."""
 
 
-@dataclass
+class Share(IntEnum):
+    """Ways besides the direct one whose part of a component's power is fitted."""
+
+    CLOSE_WALLS = 2
+    ROOM = 3
+    """All other walls and the floor."""
+    HIDDEN = 4
+    """Through surfaces in the way."""
+
+
+ASSUMED = {Share.CLOSE_WALLS: 0.5, Share.ROOM: 0.5, Share.HIDDEN: 0.2}
+"""Shares as long as the scans do not tell them. Walls reflect half; none passes a wall, but much a
+table whose edge or legs the lasers see."""
+SHARE_SIGMA = {Share.CLOSE_WALLS: 0.08, Share.ROOM: 0.02, Share.HIDDEN: 0.04}
+"""How firmly shares are held to what is assumed of them."""
+
+
+@dataclass(eq=False)
 class Component:
     """One sound of the fit.
 
     Attributes
     ----------
     place_m : ndarray, shape (2,)
+    height_m : float
+        Above or below the array [m].
     kind : Kind
-    slope : int
-        Index of the beams that fit its spectrum.
-    scans, beyond_m : ndarray, shape (V,)
-        Scans that hear it, and how far behind the first surface it lies in each [m].
-    column : ndarray, shape (V, N)
+    shares : dict
+        For each `Share` the part of its power that takes such a way.
+    strength : ndarray, shape (B,)
+        Mean square at 1 m in each sub-band.
+    paths : Paths
+    column : ndarray of float32, shape (S, D)
         What it adds at strength 1.
     """
 
     place_m: FloatArray
+    height_m: float
     kind: Kind
-    slope: int
-    scans: NDArray[np.int64]
-    beyond_m: FloatArray
+    shares: dict[Share, float]
+    strength: FloatArray
+    paths: Paths
     column: Single
-
-    @classmethod
-    def at(cls, evidence: Evidence, place_m: FloatArray, kind: Kind, slope: int) -> Component:
-        """The component of a place."""
-        scans, wave, gain, beyond = seen_from(evidence, place_m, kind)
-        return cls(place_m, kind, slope, scans, beyond, column(evidence, scans, wave, gain, slope))
 
 
 class SparseFit:
@@ -69,217 +82,301 @@ class SparseFit:
 
     Attributes
     ----------
+    evidence : Evidence
+    walls : ndarray, shape (W, 3)
     components : list of Component
-    strength : ndarray, shape (K,)
-        :math:`q_k`, mean square at 1 m.
-    residual : ndarray of float32, shape (S, N)
+    residual : ndarray of float32, shape (S, D)
+    precision : Precision
     """
 
-    def __init__(self, evidence: Evidence, candidates: Candidates) -> None:
-        from scipy.spatial import cKDTree
-
-        self.evidence, self.candidates = evidence, candidates
+    def __init__(self, evidence: Evidence, walls: FloatArray) -> None:
+        self.evidence, self.walls = evidence, walls
         self.components: list[Component] = []
-        self.strength = np.empty(0)
-        self.residual = evidence.heard.copy()
-        self.stretch = np.arange(len(evidence)) // STRETCH
-        self.stretches = int(self.stretch[-1]) + 1
-        self._gram = np.zeros((self.stretches, 0, 0))
-        self._data = np.zeros((self.stretches, 0))
-        self._along = np.zeros((self.stretches, 0))
-        self._tree = cKDTree(candidates.surface_m)
-        self._surfaces = int(np.sum(candidates.kind == Kind.SURFACE))
-        factors = np.array([KIND_FACTOR[kind] for kind in Kind])
-        self._factor = factors[candidates.kind]
+        self.residual = evidence.heard
+        self.precision = Precision(evidence, [])
+        self._gram = np.zeros((evidence.sub_bands, 0, 0))
+        self._product = np.zeros((evidence.sub_bands, 0))
+        self._energy = self._bands(evidence.heard, self.precision.times(evidence.heard))
 
     @property
-    def energy(self) -> float:
-        """What is left unexplained."""
-        return float(np.sum(self.residual.astype(np.float64) ** 2))
+    def misfit(self) -> float:
+        """What is left unexplained, in units of the noise."""
+        return self._misfit(list(range(len(self.components))))
 
-    def strength_along(self, index: int) -> FloatArray:
-        """Strength of a component in each stretch, shape (stretches,)."""
-        return self._along[:, index]
+    @property
+    def noise(self) -> float:
+        """Mean square of what is left, over what was expected."""
+        return self.misfit / self.evidence.heard.size
 
-    def evidence_along(self, index: int) -> FloatArray:
-        """How much each stretch tells of a component, shape (stretches,)."""
-        return self._gram[:, index, index]
-
-    def add(self, component: Component) -> None:
-        """One component more, and all strengths anew."""
-        self.components.append(component)
-        count = len(self.components)
-        gram, data = self._gram, self._data
-        self._gram = np.zeros((self.stretches, count, count))
-        self._gram[:, :-1, :-1] = gram
-        self._data = np.concatenate([data, np.zeros((self.stretches, 1))], axis=1)
-        self._renew(count - 1)
-        self._fit_strengths()
-
-    def remove(self, index: int) -> None:
-        """One component less, and all strengths anew."""
-        del self.components[index]
-        self._gram = np.delete(np.delete(self._gram, index, axis=1), index, axis=2)
-        self._data = np.delete(self._data, index, axis=1)
-        self._fit_strengths()
-
-    def replace(self, index: int, component: Component) -> None:
-        """Another component in the place of one, and all strengths anew."""
-        self.components[index] = component
-        self._renew(index)
-        self._fit_strengths()
-
-    def best_candidate(self, residual: Single | None = None) -> tuple[float, Component]:
-        """The candidate that explains most of a residual, and how much energy that is."""
-        residual = self.residual if residual is None else residual
-        value, index, slope = self._best(residual, FIRST_SLOPES, len(self._factor))
-        kind = Kind(int(self.candidates.kind[index]))
-        return value, Component.at(self.evidence, self.candidates.place_m[index], kind, slope)
-
-    def improve(self, radius_m: float) -> None:
-        """Move each component to the best place near it, on its own kind of place."""
-        for index in range(len(self.components)):
-            self._improve(index, radius_m)
-            self._renew(index)
-        self._fit_strengths()
-
-    def energy_at_mean_strength(self, index: int) -> float:
-        """Energy of what a component adds to the scans at its mean strength."""
-        return float(self.strength[index] ** 2 * self._gram[:, index, index].sum())
-
-    def energy_without(self, index: int) -> float:
-        """What would be left unexplained if a component were not there."""
-        kept = [i for i in range(len(self.components)) if i != index]
-        _, along = _strengths(self._gram[:, kept][:, :, kept], self._data[:, kept])
-        return self._energy_of(kept, along)
-
-    def with_own(self, index: int) -> Single:
-        """The residual with a component put back."""
-        own = self.components[index]
-        whole = self.residual.copy()
-        strength = self._along[self.stretch[own.scans], index].astype(np.float32)
-        whole[own.scans] += strength[:, None] * own.column
-        return whole
-
-    def _energy_of(self, kept: list[int], along: FloatArray) -> float:
-        data = float(np.sum(self.evidence.heard.astype(np.float64) ** 2))
-        if not kept:
-            return data
-        gram, product = self._gram[:, kept][:, :, kept], self._data[:, kept]
-        explained = 2.0 * np.sum(along * product)
-        return float(data - explained + np.einsum("bk,bkl,bl->", along, gram, along))
-
-    def _best(
-        self, residual: Single, slopes: tuple[int, ...], count: int
-    ) -> tuple[float, int, int]:
-        value = self._factor[:count] * explained_energy(
-            self.evidence,
-            residual,
-            slopes,
-            self.candidates.place_m[:count],
-            self.candidates.kind[:count],
+    def add(self, place_m: FloatArray, height_m: float, kind: Kind) -> Component:
+        """One component more, its strength still 0."""
+        nothing = np.zeros(self.evidence.sub_bands)
+        place_m = np.array(place_m, dtype=np.float64)
+        paths = sound_paths(self.evidence, self.walls, place_m, height_m, kind)
+        component = Component(
+            place_m, height_m, kind, dict(ASSUMED), nothing, paths, self.residual[:0]
         )
-        best, index = np.unravel_index(int(np.argmax(value)), value.shape)
-        return float(value[best, index]), int(index), slopes[int(best)]
+        component.column = self._column(component)
+        self.components.append(component)
+        return component
 
-    def _improve(self, index: int, radius_m: float) -> None:
+    def gain(self, index: int) -> float:
+        """Rise of the misfit if a component were not there, others' strengths fitted anew."""
+        others = [i for i in range(len(self.components)) if i != index]
+        return self._misfit(others) - self.misfit
+
+    def renew(self) -> None:
+        """Model errors as of the present strengths, and strengths as of these errors."""
+        self.precision = Precision(self.evidence, self.components)
+        heard = self.evidence.heard
+        self._energy = self._bands(heard, self.precision.times(heard))
+        self.refit()
+
+    def refit(self) -> None:
+        """All strengths anew; silent components go."""
+        self._fit_strengths()
+        kept = [c for c in self.components if c.strength.any()]
+        if len(kept) < len(self.components):
+            self.components = kept
+            self._fit_strengths()
+
+    def move(self, chosen: list[Component] | None = None, *, most_m: float = 0.1) -> None:
+        """One step of some (by default all) components to where bearings point, and a refit."""
+        chosen = self.components if chosen is None else chosen
+        hessian, gradient, owners = self._system(chosen)
+        if not owners:
+            return
+        scale = np.sqrt(np.diag(hessian)) + 1e-12
+        scaled = hessian / np.outer(scale, scale) + 1e-4 * np.eye(len(scale))
+        step = np.linalg.solve(scaled, gradient / scale) / scale
+        for position, (component, axis) in enumerate(owners):
+            if axis < 2:
+                component.place_m[axis] += np.clip(step[position], -most_m, most_m)
+            else:
+                share = component.shares[Share(axis)] + np.clip(step[position], -0.2, 0.2)
+                component.shares[Share(axis)] = float(np.clip(share, LEAST_SHARE, GREATEST_SHARE))
+        for component in {id(owner): owner for owner, _ in owners}.values():
+            self._place(component)
+        self.refit()
+
+    def choose_height(self, component: Component, heights_m: tuple[float, ...]) -> None:
+        """The height at which a component explains most, all else as it is."""
+        part, starts = self.evidence.table.part, self.evidence.table.starts[:-1]
+        own = component.column * component.strength[part].astype(np.float32)
+        target = self.residual + own
+        best, value, columns = component.height_m, -np.inf, []
+        for height in heights_m:
+            component.height_m = height
+            self._place(component)
+            columns.append(component.column)
+        weighted = self.precision.times(np.stack(columns))
+        for height, column, right in zip(heights_m, columns, weighted, strict=True):
+            match = np.add.reduceat(np.einsum("sd,sd->d", right, target), starts)
+            energy = np.add.reduceat(np.einsum("sd,sd->d", right, column), starts)
+            explained = np.sum(np.maximum(match, 0.0) ** 2 / np.maximum(energy, 1e-30))
+            if explained > value:
+                best, value = height, float(explained)
+        component.height_m = best
+        self._place(component)
+
+    def covariances(self) -> list[FloatArray]:
+        """Covariance (2, 2) of each component's place, as the noise alone would make it [m^2]."""
+        result = [np.eye(2) for _ in self.components]
+        hessian, _, owners = self._system(self.components)
+        if not owners:
+            return result
+        scale = np.sqrt(np.diag(hessian)) + 1e-12
+        inverse = np.linalg.pinv(hessian / np.outer(scale, scale), rcond=1e-8, hermitian=True)
+        inverse = inverse / np.outer(scale, scale)
+        index = {id(component): i for i, component in enumerate(self.components)}
+        for position, (component, axis) in enumerate(owners):
+            if axis == 0:
+                own = slice(position, position + 2)
+                result[index[id(component)]] = inverse[own, own]
+        return result
+
+    def strengths_along(
+        self, index: int, stretch: NDArray[np.int64]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Strength of a component in each stretch of the way, and how much the scans tell of it.
+
+        Parameters
+        ----------
+        index : int
+        stretch : ndarray of int, shape (S,)
+
+        Returns
+        -------
+        strength, told : ndarray, shape (stretches, B)
+            NaN where nothing is told.
+        """
         component = self.components[index]
-        residual = self.with_own(index)
-        kind, place = component.kind, component.place_m
-        if kind == Kind.SURFACE:
-            near = self._tree.query_ball_point(place, radius_m)
-            around = self.candidates.surface_m[sorted(near)]
-        else:
-            steps = 0.5 * radius_m * np.arange(-2, 3)
-            around = place + np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
-        places = np.concatenate([around, place[None]])
-        kinds = np.full(len(places), int(kind), dtype=np.int64)
-        slopes = tuple(range(len(SLOPES_DB_PER_OCTAVE)))
-        value = explained_energy(self.evidence, residual, slopes, places, kinds)
-        slope, top = np.unravel_index(int(np.argmax(value)), value.shape)
-        best = (float(value[slope, top]), places[top], int(slope))
-        if kind != Kind.SURFACE and self._surfaces:
-            value_there, there, its_slope = self._best(residual, FIRST_SLOPES, self._surfaces)
-            if value_there >= BACK_TO_SURFACE[kind] * best[0]:
-                kind = Kind.SURFACE
-                best = (value_there, self.candidates.place_m[there], its_slope)
-        self.components[index] = Component.at(self.evidence, best[1], kind, best[2])
+        part = self.evidence.table.part
+        own = self.residual + component.column * component.strength[part].astype(np.float32)
+        weighted = self.precision.times(component.column)
+        starts = self.evidence.table.starts[:-1]
+        product = np.add.reduceat(weighted * own, starts, axis=1)
+        energy = np.add.reduceat(weighted * component.column, starts, axis=1)
+        count = int(stretch.max()) + 1
+        match = np.stack([np.bincount(stretch, each, count) for each in product.T], axis=-1)
+        told = np.stack([np.bincount(stretch, each, count) for each in energy.T], axis=-1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            strength = np.where(told > 0.0, match / told, np.nan)
+        return np.asarray(strength, dtype=np.float64), np.asarray(told, dtype=np.float64)
 
-    def _renew(self, index: int) -> None:
-        """Products of one component with the data and with all others, stretch by stretch."""
-        own = self.components[index]
-        heard = self.evidence.heard[own.scans]
-        stretch = self.stretch[own.scans]
-        self._data[:, index] = self._sums(stretch, np.einsum("sn,sn->s", own.column, heard))
-        for other, component in enumerate(self.components):
-            _, mine, its = np.intersect1d(
-                own.scans, component.scans, assume_unique=True, return_indices=True
-            )
-            product = np.einsum("sn,sn->s", own.column[mine], component.column[its])
-            sums = self._sums(stretch[mine], product)
-            self._gram[:, index, other] = sums
-            self._gram[:, other, index] = sums
+    def _place(self, component: Component) -> None:
+        """Paths and column of a component that has moved."""
+        component.paths = sound_paths(
+            self.evidence, self.walls, component.place_m, component.height_m, component.kind
+        )
+        component.column = self._column(component)
 
-    def _sums(self, stretch: NDArray[np.int64], values: NDArray[np.float32]) -> FloatArray:
-        return np.bincount(stretch, values.astype(np.float64), self.stretches).astype(np.float64)
+    def _column(self, component: Component) -> Single:
+        column = self._heard(component, Path.DIRECT)
+        if component.kind == Kind.IMAGE:
+            return column
+        for share, paths in self._ways(component).items():
+            for path in paths:
+                column += np.float32(component.shares[share]) * self._heard(component, path)
+        return column
+
+    def _ways(self, component: Component) -> dict[Share, list[int]]:
+        """Paths that have a share, as far as any scan hears them."""
+        if component.kind == Kind.IMAGE:
+            return {}
+        off = self.walls[:, :2] @ component.place_m - self.walls[:, 2]
+        near = np.asarray(np.abs(off) < BEHIND_M)
+        ways: dict[Share, list[int]] = {
+            Share.CLOSE_WALLS: [Path.WALLS + int(wall) for wall in np.flatnonzero(near)],
+            Share.ROOM: [Path.FLOOR] + [Path.WALLS + int(wall) for wall in np.flatnonzero(~near)],
+            Share.HIDDEN: [Path.HIDDEN],
+        }
+        heard = np.asarray(component.paths.gain.max(axis=1, initial=0.0) > 0.0)
+        told = {share: [path for path in paths if heard[path]] for share, paths in ways.items()}
+        return {share: paths for share, paths in told.items() if paths}
+
+    def _heard(self, component: Component, path: int) -> Single:
+        paths = component.paths
+        return waves_heard(self.evidence, paths.wave[path], paths.aperture[path], paths.gain[path])
+
+    def _bands(self, left: Single, right: Single) -> FloatArray:
+        """Sum of products of two columns in each sub-band."""
+        product = np.einsum("sd,sd->d", left, right, dtype=np.float64)
+        return np.asarray(np.add.reduceat(product, self.evidence.table.starts[:-1]))
 
     def _fit_strengths(self) -> None:
-        self.strength, self._along = _strengths(self._gram, self._data)
-        self.residual = self.evidence.heard.copy()
-        for index, component in enumerate(self.components):
-            along = self._along[self.stretch[component.scans], index].astype(np.float32)
-            self.residual[component.scans] -= along[:, None] * component.column
+        from scipy.optimize import nnls
+
+        evidence, count = self.evidence, len(self.components)
+        self.residual = evidence.heard.copy()
+        if count == 0:
+            self._gram = np.zeros((evidence.sub_bands, 0, 0))
+            self._product = np.zeros((evidence.sub_bands, 0))
+            return
+        columns = np.stack([component.column for component in self.components])
+        self._gram, self._product = self._products(columns, self.precision.times(columns))
+        strengths = np.zeros((count, evidence.sub_bands))
+        for band, (gram, product) in enumerate(zip(self._gram, self._product, strict=True)):
+            root, scale = _scaled_root(gram)
+            solved, _ = nnls(root.T, np.linalg.solve(root, product * scale))
+            strengths[:, band] = solved * scale
+        part = evidence.table.part
+        for component, strength in zip(self.components, strengths, strict=True):
+            component.strength = strength
+            self.residual -= component.column * strength[part].astype(np.float32)
+
+    def _products(self, columns: Single, weighted: Single) -> tuple[FloatArray, FloatArray]:
+        """Gram matrices (B, K, K) of columns, and their products (B, K) with what was heard."""
+        starts, heard = self.evidence.table.starts, self.evidence.heard
+        grams, products = [], []
+        for start, stop in pairwise(starts):
+            right = weighted[:, :, start:stop].reshape(len(columns), -1)
+            left = columns[:, :, start:stop].reshape(len(columns), -1)
+            gram = (right @ left.T).astype(np.float64)
+            grams.append(0.5 * (gram + gram.T))
+            products.append((right @ heard[:, start:stop].ravel()).astype(np.float64))
+        return np.array(grams), np.array(products)
+
+    def _misfit(self, kept: list[int]) -> float:
+        """Misfit with some components only, their strengths as fits best."""
+        from scipy.optimize import nnls
+
+        misfit = float(self._energy.sum())
+        if not kept:
+            return misfit
+        for gram, product in zip(self._gram, self._product, strict=True):
+            own, match = gram[np.ix_(kept, kept)], product[kept]
+            root, scale = _scaled_root(own)
+            strength = nnls(root.T, np.linalg.solve(root, match * scale))[0] * scale
+            misfit += float(strength @ own @ strength - 2.0 * strength @ match)
+        return misfit
+
+    @property
+    def _strengths(self) -> FloatArray:
+        """Of all components, shape (K, B)."""
+        return np.array([component.strength for component in self.components])
+
+    def _bordered(self, own: Single, weighted: Single) -> FloatArray:
+        """Normal matrix of some columns, and behind them all strengths, sub-band by sub-band."""
+        starts, count, bands = self.evidence.table.starts, len(own), len(self._gram)
+        components = len(self.components)
+        matrix = np.zeros((count + bands * components, count + bands * components))
+        flat = weighted.reshape(count, -1)
+        matrix[:count, :count] = flat @ own.reshape(count, -1).T
+        columns = np.stack([component.column for component in self.components])
+        for band, gram in enumerate(self._gram):
+            part = slice(starts[band], starts[band + 1])
+            place = slice(count + band * components, count + (band + 1) * components)
+            left = weighted[:, :, part].reshape(count, -1)
+            matrix[:count, place] = left @ columns[:, :, part].reshape(components, -1).T
+            matrix[place, :count] = matrix[:count, place].T
+            matrix[place, place] = gram
+        return matrix
+
+    def _system(
+        self, chosen: list[Component]
+    ) -> tuple[FloatArray, FloatArray, list[tuple[Component, int]]]:
+        """Normal equations of places (axes 0, 1) and shares (as `Share`), strengths free.
+
+        The strengths' own unknowns stand last; only the first ones have owners.
+        """
+        evidence, part = self.evidence, self.evidence.table.part
+        columns: list[Single] = []
+        owners: list[tuple[Component, int]] = []
+        for component in chosen:
+            if np.count_nonzero(component.paths.gain[Path.DIRECT]) < 3:
+                continue
+            strength = component.strength[part].astype(np.float32)
+            turned = bearing_derivative(evidence, component.paths) * strength
+            step = component.place_m - evidence.place_m
+            square = np.maximum(np.sum(step**2, axis=1), NEAREST_M**2) / evidence.handedness
+            for axis, bearing in enumerate((-step[:, 1] / square, step[:, 0] / square)):
+                columns.append(turned * bearing.astype(np.float32)[:, None])
+                owners.append((component, axis))
+            for share, paths in self._ways(component).items():
+                heard = np.sum([self._heard(component, path) for path in paths], axis=0)
+                columns.append(heard * strength)
+                owners.append((component, share))
+        if not owners:
+            return np.zeros((0, 0)), np.zeros(0), owners
+        own = np.stack(columns)
+        weighted = self.precision.times(own)
+        hessian = self._bordered(own, weighted)
+        gradient = np.zeros(len(hessian))
+        gradient[: len(own)] = weighted.reshape(len(own), -1) @ self.residual.ravel()
+        rest = self._product - np.einsum("bkl,lb->bk", self._gram, self._strengths)
+        gradient[len(own) :] = rest.ravel()
+        for position, (component, axis) in enumerate(owners):
+            hold = HOLD if axis < 2 else SHARE_SIGMA[Share(axis)] ** -2
+            hessian[position, position] += hold
+            if axis >= 2:
+                share = Share(axis)
+                gradient[position] -= hold * (component.shares[share] - ASSUMED[share])
+        return hessian, gradient, owners
 
 
-def _strengths(gram: FloatArray, data: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mean strengths (K,), not negative, and those of each stretch (B, K), held to the mean."""
-    from scipy.optimize import nnls
-
-    count = gram.shape[1]
-    if count == 0:
-        return np.empty(0), np.zeros((len(gram), 0))
-    whole = gram.sum(axis=0)
-    whole += 1e-9 * np.trace(whole) * np.eye(count)
-    root = np.linalg.cholesky(whole)
-    mean, _ = nnls(root.T, np.linalg.solve(root, data.sum(axis=0)))
-    told = np.einsum("bkk->bk", gram)
-    hold = STIFFNESS * told.mean(axis=0) + 1e-30
-    along = np.tile(mean, (len(gram), 1))
-    for _ in range(ROUNDS):
-        for k in np.flatnonzero(mean > 0.0):
-            rest = data[:, k] - np.einsum("bl,bl->b", gram[:, k], along) + told[:, k] * along[:, k]
-            fitted = (rest + hold[k] * mean[k]) / (told[:, k] + hold[k])
-            along[:, k] = np.clip(fitted, LEAST_STRENGTH * mean[k], GREATEST_STRENGTH * mean[k])
-        mean = np.where(mean > 0.0, (told * along).sum(axis=0) / (told.sum(axis=0) + 1e-300), 0.0)
-    return np.asarray(mean), along
-
-
-def fitted_components(
-    evidence: Evidence, candidates: Candidates, *, least_share: float, most: int
-) -> SparseFit:
-    """The sparse fit, grown until no candidate explains enough of what is left.
-
-    Parameters
-    ----------
-    evidence : Evidence
-    candidates : Candidates
-        At least one.
-    least_share : float
-        Least share of the energy left that a new component has to explain.
-    most : int
-        Components at most.
-    """
-    fit = SparseFit(evidence, candidates)
-    for _ in range(most):
-        value, component = fit.best_candidate()
-        if value < least_share * fit.energy:
-            break
-        fit.add(component)
-        fit.improve(0.15)
-        fit.improve(0.08)
-        gone = [index for index, strength in enumerate(fit.strength) if strength <= 0.0]
-        for index in reversed(gone):
-            fit.remove(index)
-        if len(fit.components) in gone:
-            break
-    return fit
+def _scaled_root(gram: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Cholesky root of a Gram matrix whose diagonal is scaled to 1, and that scale."""
+    scale = np.asarray(1.0 / np.sqrt(np.diag(gram) + 1e-30))
+    scaled = gram * np.outer(scale, scale) + 1e-6 * np.eye(len(gram))
+    return np.asarray(np.linalg.cholesky(scaled), dtype=np.float64), scale

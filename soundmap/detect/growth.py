@@ -1,0 +1,143 @@
+"""Growth: how the fit comes by its components, and which of them are one."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+
+from soundmap.detect.candidates import Candidates, best_candidates
+from soundmap.detect.evidence import Evidence
+from soundmap.detect.matched_filter import (
+    HEIGHTS_M,
+    LEAST_SCANS,
+    effective_number,
+    explained,
+    matched_scans,
+)
+from soundmap.detect.sound_paths import Kind, Path
+from soundmap.detect.sparse_fit import Component, SparseFit
+from soundmap.geometry import FloatArray
+
+LEAST_GAIN = 150.0
+"""The fit grows until no candidate explains more than this, in units of the noise."""
+LEAST_SHARE = 0.35
+"""Candidates of one round explain at least this share of what the best near them does."""
+APART_M = 2.0
+AT_ONCE = 4
+MOST_ROUNDS, MOST_COMPONENTS = 14, 16
+ONE_SOURCE_M = 0.75
+"""Components nearer to each other than this may be one source."""
+IN_VIEW_SHARE = 0.7
+"""An image becomes a source if as such it explains at least this share."""
+HEIGHTS_TRIED_M = (0.1, 0.3, 0.6, 1.0, 1.4)
+MERGE_SHARE = 0.4
+"""They are, if one in their midst loses less than this share of what the lesser of both gains."""
+STEPS = 4
+
+
+def grown_fit(evidence: Evidence, walls: FloatArray, candidates: Candidates) -> SparseFit:
+    """The sparse fit, grown from nothing, its components placed and none of them twice.
+
+    Parameters
+    ----------
+    evidence : Evidence
+    walls : ndarray, shape (W, 3)
+    candidates : Candidates
+    """
+    fit = SparseFit(evidence, walls)
+    for _ in range(MOST_ROUNDS):
+        matched = matched_scans(evidence, fit.residual, fit.precision)
+        found = best_candidates(
+            evidence,
+            matched,
+            candidates,
+            least=LEAST_GAIN,
+            least_share=LEAST_SHARE,
+            apart_m=APART_M,
+            most=AT_ONCE,
+        )
+        if not found:
+            break
+        for candidate in found:
+            value = explained(evidence, matched, candidate.place_m[None], candidate.kind)[0]
+            fit.add(candidate.place_m, float(HEIGHTS_M[int(np.argmax(value))]), candidate.kind)
+        fit.refit()
+        fit.renew()
+        fit.move()
+        fit.move()
+        if len(fit.components) >= MOST_COMPONENTS:
+            break
+    _merge(fit)
+    fit.renew()
+    _bring_into_view(fit)
+    for _ in range(STEPS):
+        fit.move()
+    for component in fit.components:
+        fit.choose_height(component, HEIGHTS_TRIED_M)
+    fit.refit()
+    fit.move()
+    fit.renew()
+    return fit
+
+
+def _bring_into_view(fit: SparseFit) -> None:
+    """Make sources of images that can be heard directly from many places.
+
+    Nothing is seen past a mirror image, which lies behind a wall. What lies behind a surface for
+    some scans and not for others is a source behind something that stands in the room.
+    """
+    for image in [c for c in fit.components if c.kind == Kind.IMAGE]:
+        kept, worth = copy.copy(fit.components), fit.gain(fit.components.index(image))
+        fit.components = [c for c in kept if c is not image]
+        source = fit.add(image.place_m, image.height_m, Kind.SOURCE)
+        enough = effective_number(source.paths.gain[Path.DIRECT]) > LEAST_SCANS
+        if enough:
+            fit.refit()
+            for _ in range(STEPS):
+                fit.move([source])
+        present = any(c is source for c in fit.components)
+        if not present or not enough or fit.gain(len(fit.components) - 1) < IN_VIEW_SHARE * worth:
+            fit.components = kept
+            fit.refit()
+
+
+def _merge(fit: SparseFit) -> None:
+    """Put one component in the place of two where it explains nearly as much."""
+    tried: set[tuple[int, int]] = set()
+    while (pair := _nearest_pair(fit.components, tried)) is not None:
+        first, second = pair
+        tried.add((id(first), id(second)))
+        before, kept = fit.misfit, copy.copy(fit.components)
+        index = {id(component): i for i, component in enumerate(kept)}
+        worth = min(fit.gain(index[id(first)]), fit.gain(index[id(second)]))
+        weight = np.array([_energy(fit, first), _energy(fit, second)])
+        share = weight / max(weight.sum(), 1e-30)
+        louder = first if weight[0] >= weight[1] else second
+        fit.components = [c for c in kept if c is not first and c is not second]
+        middle = share[0] * first.place_m + share[1] * second.place_m
+        joint = fit.add(middle, louder.height_m, louder.kind)
+        fit.refit()
+        for _ in range(STEPS):
+            fit.move([joint])
+        if fit.misfit - before > MERGE_SHARE * worth:
+            fit.components = kept
+            fit.refit()
+
+
+def _nearest_pair(
+    components: list[Component], tried: set[tuple[int, int]]
+) -> tuple[Component, Component] | None:
+    """The two components nearest to each other that may be one and were not tried yet."""
+    best, least = None, ONE_SOURCE_M
+    for index, first in enumerate(components):
+        for second in components[:index]:
+            away = float(np.hypot(*(first.place_m - second.place_m)))
+            if away < least and (id(first), id(second)) not in tried:
+                best, least = (first, second), away
+    return best
+
+
+def _energy(fit: SparseFit, component: Component) -> float:
+    strength = component.strength[fit.evidence.table.part]
+    return float(np.sum((component.column * strength) ** 2))

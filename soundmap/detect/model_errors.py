@@ -1,0 +1,129 @@
+r"""Model errors: in what ways scans may differ from what the components of a fit predict.
+
+The prediction of a loud source is off by some share: its strength changes with the direction it is
+heard from and with its reflections' interference, its bearing is bent by them and by pose errors,
+its height is not known, walls reflect more or less than assumed. Each is a *mode*: a pattern of its
+own in each scan, random in size. With all modes u of a scan and noise of unit variance the scan has
+the covariance
+
+.. math:: \Sigma = I + \sum u u^T,
+
+and what a weak source adds counts only as far as no error of a loud one could have added it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from typing import Protocol
+
+import numpy as np
+
+from soundmap.detect.evidence import Evidence
+from soundmap.detect.harmonics import Single
+from soundmap.detect.sound_paths import Path, Paths, waves_heard
+from soundmap.geometry import FloatArray
+
+STRENGTH_ERROR = 0.35
+"""Standard deviation of a source's strength in one scan, over its mean strength."""
+BEARING_ERROR = 0.2
+"""Of its bearing, over half the width of the beam: most of it is interference."""
+APERTURE_ERROR = 0.03
+"""Of the cosine of its elevation."""
+REFLECTION_ERROR = 0.35
+"""Of the share of power that walls and the floor reflect."""
+HIDDEN_ERROR = 0.35
+"""Of the share that passes a surface in the way."""
+LEAST_MODE = 0.05
+"""A mode whose energy stays below this in all scans changes nothing."""
+SCANS_AT_ONCE = 128
+
+
+class Sounding(Protocol):
+    """What modes are made of."""
+
+    paths: Paths
+    strength: FloatArray
+
+
+class Precision:
+    r"""Inverse covariance :math:`\Sigma^{-1}` of every scan, sub-band by sub-band.
+
+    Attributes
+    ----------
+    inverse : list of ndarray of float32
+        One (S, d, d) for each sub-band.
+    """
+
+    def __init__(self, evidence: Evidence, components: Sequence[Sounding]) -> None:
+        starts = evidence.table.starts
+        self.starts = starts
+        self.inverse = [
+            np.empty((len(evidence), stop - start, stop - start), dtype=np.float32)
+            for start, stop in pairwise(starts)
+        ]
+        for first in range(0, len(evidence), SCANS_AT_ONCE):
+            scans = slice(first, min(first + SCANS_AT_ONCE, len(evidence)))
+            modes = [mode for each in components for mode in _modes(evidence, each, scans)]
+            for band, inverse in enumerate(self.inverse):
+                own = slice(starts[band], starts[band + 1])
+                inverse[scans] = _inverse([mode[:, own] for mode in modes], inverse.shape[1])
+
+    def times(self, columns: Single) -> Single:
+        r""":math:`\Sigma^{-1}` times columns (..., S, D)."""
+        out = np.empty_like(columns)
+        flat, result = columns.reshape(-1, *columns.shape[-2:]), out.reshape(-1, *out.shape[-2:])
+        for band, inverse in enumerate(self.inverse):
+            own = slice(self.starts[band], self.starts[band + 1])
+            part = np.ascontiguousarray(flat[:, :, own].transpose(1, 2, 0))
+            result[:, :, own] = np.matmul(inverse, part).transpose(2, 0, 1)
+        return out
+
+
+def _inverse(modes: list[Single], size: int) -> Single:
+    """Inverse of the identity plus the squares of all modes, each (S, d)."""
+    loud = [mode for mode in modes if np.einsum("sd,sd->s", mode, mode).max() > LEAST_MODE]
+    if not loud:
+        return np.eye(size, dtype=np.float32)[None]
+    stacked = np.stack(loud, axis=1)
+    covariance = np.matmul(stacked.transpose(0, 2, 1), stacked)
+    covariance[:, np.arange(size), np.arange(size)] += 1.0
+    return np.asarray(np.linalg.inv(covariance), dtype=np.float32)
+
+
+def _modes(evidence: Evidence, component: Sounding, scans: slice) -> Iterator[Single]:
+    """Modes of one component in some scans, each (S, D)."""
+    if not component.strength.any():
+        return
+    part = evidence.table.part
+    strength = component.strength[part].astype(np.float32)
+    bearing = (BEARING_ERROR * evidence.table.width_rad)[part].astype(np.float32)
+    paths = component.paths
+    wave, gain = paths.wave[:, scans], paths.gain[:, scans]
+    aperture = paths.aperture[:, scans]
+
+    def heard(path: int, turned: float = 0.0, lowered: float = 0.0) -> Single:
+        return waves_heard(
+            evidence, wave[path] + turned, aperture[path] - lowered, gain[path], scans
+        )
+
+    if gain[Path.DIRECT].any():
+        here = heard(Path.DIRECT)
+        yield here * (np.float32(STRENGTH_ERROR) * strength)
+        yield bearing_derivative(evidence, paths, scans) * (bearing * strength)
+        lowered = heard(Path.DIRECT, lowered=APERTURE_ERROR)
+        yield (here - lowered) * strength
+    for path in (Path.FLOOR, *range(Path.WALLS, len(gain))):
+        if gain[path].any():
+            yield heard(path) * (np.float32(REFLECTION_ERROR) * strength)
+    if gain[Path.HIDDEN].any():
+        yield heard(Path.HIDDEN) * (np.float32(HIDDEN_ERROR) * strength)
+
+
+def bearing_derivative(evidence: Evidence, paths: Paths, scans: slice = slice(None)) -> Single:
+    """Change of what is heard directly with the bearing, shape (S, D) [1/rad]."""
+    wave, aperture = paths.wave[Path.DIRECT, scans], paths.aperture[Path.DIRECT, scans]
+    step = 2.0 * np.pi / evidence.table.waves
+    gain = paths.gain[Path.DIRECT, scans] / (2.0 * step)
+    after = waves_heard(evidence, wave + 1.0, aperture, gain, scans)
+    return after - waves_heard(evidence, wave - 1.0, aperture, gain, scans)

@@ -1,0 +1,260 @@
+r"""Sound paths: how a source reaches the array, directly and by the surfaces around it.
+
+Along each path the array hears a wave from some bearing, of some aperture, and
+
+.. math:: g = 1 / (\max(d, 0.3\,\mathrm{m})^2 + h^2)
+
+of the mean square that the source has at 1 m, d being the way over the floor plan and h the height
+between the array and the source or its image. Mirror images by walls exist where the lasers see the
+wall at the point of reflection.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from soundmap.detect.evidence import Evidence
+from soundmap.detect.harmonics import APERTURES, Single
+from soundmap.geometry import FloatArray
+
+REACH_M = 9.0
+"""Sound from farther away tells nothing of where its source is."""
+NEAREST_M = 0.3
+BEYOND_M, BEYOND_PER_M = 0.35, 0.02
+"""What lies farther behind the first surface than this is hidden by it [m] [m/m]."""
+DEEPEST_M = 2.8
+"""Unexplained mirror images are taken to lie no farther behind a surface than this [m]."""
+ON_MIRROR_M, ON_MIRROR_PER_M = 0.2, 0.03
+"""A wall reflects where the lasers see a surface within this of it [m] [m/m]."""
+LEAST_FLOOR_M = 0.5
+"""Height between the array and images below the floor, if its own height is not known."""
+
+
+class Kind(IntEnum):
+    """Where a component of the fit lies as the lasers see it."""
+
+    SOURCE = 0
+    """On a surface or in the open."""
+    IMAGE = 1
+    """Behind a surface: a reflection that no wall explains, or one of something unknown."""
+
+
+class Path(IntEnum):
+    """Which way a path goes; those by the walls follow."""
+
+    DIRECT = 0
+    FLOOR = 1
+    HIDDEN = 2
+    """The direct way, where a surface hides it: some sound may pass all the same."""
+    WALLS = 3
+
+
+@dataclass(frozen=True)
+class Paths:
+    """All paths of a source to the scans.
+
+    Attributes
+    ----------
+    wave, aperture, gain : ndarray, shape (P, S)
+        Direction in steps of the beams' directions, cosine of the elevation, and gain; 0 where
+        the path does not exist. The paths are in the order of `Path`.
+    beyond_m : ndarray, shape (S,)
+        How far behind the first surface on its bearing the source lies [m]; NaN where unknown.
+    """
+
+    wave: FloatArray
+    aperture: FloatArray
+    gain: FloatArray
+    beyond_m: FloatArray
+
+
+def sound_paths(
+    evidence: Evidence, walls: FloatArray, place_m: FloatArray, height_m: float, kind: Kind
+) -> Paths:
+    """Paths of one source.
+
+    Parameters
+    ----------
+    evidence : Evidence
+    walls : ndarray, shape (W, 3)
+        Unit normal and offset of each.
+    place_m : ndarray, shape (2,)
+        In the map frame [m].
+    height_m : float
+        Above or below the array [m], >= 0.
+    kind : Kind
+    """
+    return Paths(
+        *_paths(
+            np.ascontiguousarray(place_m, dtype=np.float64),
+            height_m,
+            kind == Kind.IMAGE,
+            walls,
+            max(2.0 * evidence.height_m, LEAST_FLOOR_M),
+            evidence.place_m,
+            evidence.axis_rad,
+            float(evidence.handedness),
+            evidence.range_m,
+        )
+    )
+
+
+@njit(cache=True, nogil=True)
+def seen(distance: float, beyond: float, behind: bool) -> bool:
+    """Whether what lies so far away, and so far behind the first surface, is heard directly."""
+    if distance > REACH_M:
+        return False
+    if behind:
+        return -0.1 < beyond < DEEPEST_M
+    return not beyond > BEYOND_M + BEYOND_PER_M * distance  # also where no surface is known
+
+
+@njit(cache=True, nogil=True)
+def _wave(dx: float, dy: float, axis: float, hand: float, waves: int) -> float:
+    turn = hand * (np.arctan2(dy, dx) - axis) / (2.0 * np.pi)
+    return (turn - np.floor(turn)) * waves
+
+
+@njit(cache=True, nogil=True)
+def _paths(
+    place: FloatArray,
+    height: float,
+    behind: bool,
+    walls: FloatArray,
+    floor: float,
+    stand: FloatArray,
+    axis: FloatArray,
+    hand: float,
+    ranges: Single,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    scans, waves = ranges.shape
+    paths = 3 + len(walls)
+    wave = np.zeros((paths, scans))
+    aperture = np.ones((paths, scans))
+    gain = np.zeros((paths, scans))
+    beyond = np.empty(scans)
+    for s in range(scans):
+        dx, dy = place[0] - stand[s, 0], place[1] - stand[s, 1]
+        distance = np.sqrt(dx * dx + dy * dy)
+        wave[:3, s] = _wave(dx, dy, axis[s], hand, waves)
+        beyond[s] = distance - ranges[s, int(wave[0, s] + 0.5) % waves]
+        if distance > REACH_M:
+            continue
+        near = max(distance, NEAREST_M)
+        heard = seen(distance, beyond[s], behind)
+        for path, up in ((0 if heard else 2, height), (1, floor)):
+            if (path != 0 and behind) or (path == 1 and not heard):
+                continue
+            square = near * near + up * up
+            aperture[path, s] = near / np.sqrt(square)
+            gain[path, s] = 1.0 / square
+        if behind:
+            continue
+        for w in range(len(walls)):
+            own = place[0] * walls[w, 0] + place[1] * walls[w, 1] - walls[w, 2]
+            side = stand[s, 0] * walls[w, 0] + stand[s, 1] * walls[w, 1] - walls[w, 2]
+            if own * side <= 0.0:
+                continue
+            dx = place[0] - 2.0 * own * walls[w, 0] - stand[s, 0]
+            dy = place[1] - 2.0 * own * walls[w, 1] - stand[s, 1]
+            far = np.sqrt(dx * dx + dy * dy)
+            if far > REACH_M:
+                continue
+            at = _wave(dx, dy, axis[s], hand, waves)
+            mirror = side / (side + own) * far
+            surface = ranges[s, int(at + 0.5) % waves]
+            if abs(surface - mirror) < ON_MIRROR_M + ON_MIRROR_PER_M * mirror:
+                square = far * far + height * height
+                wave[3 + w, s] = at
+                aperture[3 + w, s] = far / np.sqrt(square)
+                gain[3 + w, s] = 1.0 / square
+    return wave, aperture, gain, beyond
+
+
+def waves_heard(
+    evidence: Evidence,
+    wave: FloatArray,
+    aperture: FloatArray,
+    gain: FloatArray,
+    scans: slice = slice(None),
+) -> Single:
+    """What a wave of power 1 at 1 m adds to each scan, in units of the noise, shape (S, D).
+
+    Parameters
+    ----------
+    evidence : Evidence
+    wave, aperture, gain : ndarray, shape (S,)
+        As in `Paths`, of the scans meant.
+    scans : slice, optional
+        Which they are.
+    """
+    out = np.zeros((len(wave), evidence.heard.shape[1]), dtype=np.float32)
+    turn = evidence.turn_rad[scans] / (2.0 * np.pi) * evidence.table.waves
+    _add_waves(
+        out,
+        evidence.table.beams,
+        evidence.table.starts,
+        APERTURES,
+        wave,
+        aperture,
+        gain,
+        turn,
+        evidence.weight[scans],
+    )
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _add_waves(
+    out: Single,
+    beams: Single,
+    starts: NDArray[np.int64],
+    apertures: FloatArray,
+    wave: FloatArray,
+    aperture: FloatArray,
+    gain: FloatArray,
+    turn: FloatArray,
+    weight: FloatArray,
+) -> None:
+    """Beams interpolated between the two nearest directions and apertures.
+
+    While the array turns the beam is smeared: three directions with the variance of an even turn
+    stand for it.
+    """
+    directions = beams.shape[1]
+    for s in range(len(wave)):
+        if gain[s] == 0.0:
+            continue
+        e = 0
+        while e < len(apertures) - 2 and apertures[e + 1] > aperture[s]:
+            e += 1
+        low = (apertures[e] - aperture[s]) / (apertures[e] - apertures[e + 1])
+        low = min(max(low, 0.0), 1.0)
+        step = turn[s] / np.sqrt(8.0)
+        looks = 3 if step > 0.2 else 1
+        for j in range(looks):
+            at = wave[s] + (j - 1) * step if looks == 3 else wave[s]
+            at -= np.floor(at / directions) * directions
+            left = int(at)
+            share = at - left
+            left %= directions
+            right = (left + 1) % directions
+            for b in range(len(starts) - 1):
+                size = gain[s] * weight[s, b] / looks
+                a0, a1 = (
+                    np.float32((1 - low) * (1 - share) * size),
+                    np.float32((1 - low) * share * size),
+                )
+                b0, b1 = np.float32(low * (1 - share) * size), np.float32(low * share * size)
+                for d in range(starts[b], starts[b + 1]):
+                    out[s, d] += (
+                        a0 * beams[e, left, d]
+                        + a1 * beams[e, right, d]
+                        + b0 * beams[e + 1, left, d]
+                        + b1 * beams[e + 1, right, d]
+                    )

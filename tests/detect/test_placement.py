@@ -1,0 +1,36 @@
+import numpy as np
+import pytest
+
+from soundmap.detect.placement import placement
+
+WALL = np.column_stack([np.full(100, 2.0), 0.04 * np.arange(100)])
+ALONG_X = np.diag([0.03**2, 0.004**2])
+
+
+def placed(x, odds):
+    return placement(np.array([x, 1.0]), ALONG_X, WALL, np.full(len(WALL), odds))
+
+
+def test_a_source_a_little_off_a_machine_is_on_it():
+    found = placed(1.9, odds=30.0)
+    np.testing.assert_allclose(found.place_m, (2.0, 1.0), atol=0.02)
+    assert found.on_surface
+    assert found.covariance_m2[0, 0] < ALONG_X[0, 0]
+
+
+def test_a_source_far_before_a_wall_stays_there():
+    found = placed(1.6, odds=0.5)
+    np.testing.assert_allclose(found.place_m, (1.6, 1.0), atol=0.01)
+    assert not found.on_surface
+
+
+def test_a_source_between_is_told_to_be_uncertain():
+    found = placed(1.84, odds=2.0)
+    assert 1.84 < found.place_m[0] < 2.0
+    assert np.sqrt(found.covariance_m2[0, 0]) > 0.06
+
+
+def test_without_any_surface_bearings_decide():
+    found = placement(np.ones(2), ALONG_X, np.zeros((0, 2)), np.zeros(0))
+    assert found.place_m == pytest.approx([1.0, 1.0])
+    assert not found.on_surface
