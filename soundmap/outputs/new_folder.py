@@ -6,8 +6,10 @@ renaming when all is done. Whatever stops the work before that leaves what was t
 
 from __future__ import annotations
 
+import glob
 import json
 import os
+import re
 import secrets
 import shutil
 from collections.abc import Iterable, Iterator
@@ -42,17 +44,23 @@ def new_folder(folder: Path, *, force: bool, inputs: Iterable[Path] = ()) -> Ite
     target = Path(os.path.realpath(folder))
     inputs = [Path(os.path.realpath(path)) for path in inputs]
     with writing(folder):
+        _tidy_up(target)
         _refuse_to_replace(folder, target, force=force, inputs=inputs)
     partial = target.with_name(f".{target.name}.partial-{secrets.token_hex(4)}")
     parents = [parent for parent in target.parents if not parent.exists()]
+    lock = None
     try:
         with writing(folder):
-            partial.mkdir(parents=True)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            lock = _locked_folder(partial)
         yield partial
         with writing(folder):
+            _flush(partial)
             _refuse_to_replace(folder, target, force=force, inputs=inputs)
             _swap_in(partial, target)
     finally:
+        if lock is not None:
+            os.close(lock)
         shutil.rmtree(partial, ignore_errors=True)
         _remove_if_empty(parents)
 
@@ -87,7 +95,12 @@ def writing(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        place = f"{error.filename}: " if error.filename else ""
+        name = str(error.filename or "")
+        # Whoever wrote to the hidden folder means the one that it was to become.
+        hidden = re.fullmatch(r"\.(.+)\.partial-[0-9a-f]{8}", folder.name)
+        if hidden:
+            name, folder = name.replace(folder.name, hidden[1]), folder.with_name(hidden[1])
+        place = f"{name}: " if name else ""
         raise OutputError(
             f"{folder}: cannot be written ({place}{error.strerror or error}). "
             "Make room or name another folder with --out."
@@ -130,6 +143,58 @@ def _is_of_soundmap(folder: Path) -> bool:
     except (OSError, ValueError, RecursionError):
         return False
     return isinstance(report, dict) and "soundmap" in report
+
+
+def _locked_folder(partial: Path) -> int | None:
+    """Make a folder; the open, locked handle shows that its maker still lives.
+
+    It gets its name once it is locked, so that nobody takes it for an abandoned one.
+    """
+    unnamed = partial.with_name(f".{secrets.token_hex(8)}")
+    unnamed.mkdir()
+    lock = _lock(unnamed)
+    unnamed.rename(partial)
+    return lock
+
+
+def _lock(folder: Path) -> int | None:
+    """A handle that holds the only lock on a folder; None if it is taken, or there are no locks."""
+    try:
+        import fcntl
+    except ImportError:  # not a Unix
+        return None
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(handle)
+        return None
+    return handle
+
+
+def _tidy_up(target: Path) -> None:
+    """Remove what killed runs left beside the target; bring back what one was about to replace."""
+    for old in target.parent.glob(f".{glob.escape(target.name)}.old-*"):
+        if target.exists():
+            shutil.rmtree(old, ignore_errors=True)
+        else:
+            old.rename(target)
+    for partial in target.parent.glob(f".{glob.escape(target.name)}.partial-*"):
+        lock = _lock(partial)
+        if lock is not None:
+            shutil.rmtree(partial, ignore_errors=True)
+            os.close(lock)
+
+
+def _flush(folder: Path) -> None:
+    """Wait until all files are on the disk: only then does a full disk always show."""
+    for path in [*folder.rglob("*"), folder]:
+        if path.is_file() or os.name == "posix":
+            handle = os.open(path, os.O_RDONLY)
+            try:
+                os.fsync(handle)
+            finally:
+                os.close(handle)
 
 
 def _swap_in(partial: Path, target: Path) -> None:

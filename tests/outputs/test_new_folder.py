@@ -152,3 +152,33 @@ def test_a_link_to_a_folder_stays_a_link(tmp_path):
     write_run_folder(tmp_path / "run1")
     assert (tmp_path / "run1").is_symlink()
     assert names(tmp_path / "disk") == ["content", "report.json"]
+
+
+def test_what_a_killed_run_left_is_tidied_up_and_what_a_living_one_writes_is_not(tmp_path):
+    left = tmp_path / ".run1.partial-0123abcd"
+    left.mkdir()
+    (left / "content").write_text("half")
+    others = tmp_path / ".run10.partial-0123abcd"
+    others.mkdir()
+
+    def outrun():
+        with new_folder(tmp_path / "run1", force=False) as partial:
+            assert not left.exists()
+            (partial / "content").write_text("mine")
+            write_run_folder(tmp_path / "run1", content="theirs")
+            assert (partial / "content").read_text() == "mine"
+
+    with pytest.raises(OutputError, match="not empty"):
+        outrun()
+    assert (tmp_path / "run1" / "content").read_text() == "theirs"
+    assert names(tmp_path) == [others.name, "run1"]
+
+
+def test_a_run_that_was_about_to_be_replaced_when_the_process_was_killed_comes_back(tmp_path):
+    old = tmp_path / ".run.old-0123abcd"
+    old.mkdir()
+    (old / "report.json").write_text('{"soundmap": "0.1"}')
+    with pytest.raises(OutputError, match="not empty"), new_folder(tmp_path / "run", force=False):
+        pass
+    assert (tmp_path / "run" / "report.json").exists()
+    assert not old.exists()

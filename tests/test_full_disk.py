@@ -1,0 +1,48 @@
+"""A disk that fills up: a clear error, and nothing half written, whichever file it stops at."""
+
+import resource
+import signal
+from contextlib import contextmanager
+
+import pytest
+from handmade import made_run
+
+from soundmap.errors import OutputError
+from soundmap.outputs.new_folder import new_folder
+from soundmap.outputs.run_folder import write_run
+
+
+@contextmanager
+def files_no_larger_than(size):
+    """As on a full disk, writing beyond this many bytes of a file fails."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    earlier = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, earlier)
+
+
+def sizes(folder):
+    return sorted({file.stat().st_size for file in folder.iterdir()})
+
+
+def test_a_disk_that_is_full_at_any_output_leaves_nothing_behind(tmp_path):
+    run = made_run()
+    with new_folder(tmp_path / "whole", force=False) as folder:
+        write_run(run, folder)
+    written = sizes(tmp_path / "whole")
+    assert len(written) > 8
+    for size in written:
+        with (
+            files_no_larger_than(size - 1),
+            pytest.raises(OutputError, match="cut: cannot be written"),
+            new_folder(tmp_path / "cut", force=False) as folder,
+        ):
+            write_run(run, folder)
+        assert [path.name for path in tmp_path.iterdir()] == ["whole"]
+    with files_no_larger_than(2 * written[-1]), new_folder(tmp_path / "cut", force=False) as folder:
+        write_run(run, folder)
+    assert len(list((tmp_path / "cut").iterdir())) == len(list((tmp_path / "whole").iterdir()))
