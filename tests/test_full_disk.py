@@ -9,7 +9,9 @@ from handmade import made_run
 
 from soundmap.errors import OutputError
 from soundmap.outputs.new_folder import new_folder
+from soundmap.outputs.progress import chosen_progress
 from soundmap.outputs.run_folder import write_run
+from soundmap.retelling import recording_of
 
 
 @contextmanager
@@ -46,3 +48,12 @@ def test_a_disk_that_is_full_at_any_output_leaves_nothing_behind(tmp_path):
     with files_no_larger_than(2 * written[-1]), new_folder(tmp_path / "cut", force=False) as folder:
         write_run(run, folder)
     assert len(list((tmp_path / "cut").iterdir())) == len(list((tmp_path / "whole").iterdir()))
+
+
+def test_a_recording_that_does_not_fit_on_the_disk_is_an_error_and_leaves_the_run_alone(tmp_path):
+    with new_folder(tmp_path / "run", force=False) as folder:
+        write_run(made_run(), folder)
+    before = sorted(path.name for path in (tmp_path / "run").iterdir())
+    with files_no_larger_than(50_000), pytest.raises(OutputError, match="cannot be written"):
+        recording_of(tmp_path / "run", progress=chosen_progress(quiet=True))
+    assert sorted(path.name for path in (tmp_path / "run").iterdir()) == before

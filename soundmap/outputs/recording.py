@@ -55,15 +55,20 @@ ELLIPSE_SIGMAS = 2.0
 
 @contextmanager
 def recording(file: Path, blueprint: rr.blueprint.Blueprint) -> Iterator[rr.RecordingStream]:
-    """A stream that writes a complete file, whatever happens in between."""
+    """A stream whose content becomes a complete file, whatever happens in between.
+
+    The file is written here because a stream that meets a full disk waits for ever.
+    """
     stream = rr.RecordingStream(APPLICATION)
-    stream.save(file, default_blueprint=blueprint)
+    kept = rr.binary_stream(stream)
+    stream.send_blueprint(blueprint, make_active=False, make_default=True)
     try:
         stream.log("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         yield stream
     finally:
-        stream.flush()
+        content = kept.read(flush=True) or b""
         stream.disconnect()
+        file.write_bytes(content)
 
 
 class RunRecording:
