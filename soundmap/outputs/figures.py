@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from soundmap.change import ChangeKind, PowerRatio
+from soundmap.change import Change, ChangeKind, PowerRatio
 from soundmap.geometry import FloatArray, Trajectory
 from soundmap.grid import GridFrame, OccupancyGrid
 from soundmap.outputs.floor import DOUBTFUL, FOUND, FloorPlan, Mark, Places, area_of_interest
@@ -132,9 +132,10 @@ def power_ratio_figure(ratio: PowerRatio, *, room: OccupancyGrid | None, title: 
             label="against the background's median",
         )
     plan.draw_wall_outlines()
-    plan.draw_places(
-        places, [CHANGED[change.kind] for change in ratio.changes], list(image.to_rgba(ratios))
-    )
+    fills = image.to_rgba(ratios)
+    if ratio.chance is not None:
+        fills[[not _is_sure(change) for change in ratio.changes], 3] = PALE
+    plan.draw_places(places, [CHANGED[change.kind] for change in ratio.changes], list(fills))
     return plan.finished()
 
 
@@ -149,6 +150,11 @@ def _draw_sources(plan: FloorPlan, sources: SourceList) -> None:
     )
     doubtful = [source.fit is not None and bool(source.fit.flags) for source in sources]
     plan.draw_places(places, [DOUBTFUL if doubt else FOUND for doubt in doubtful])
+
+
+def _is_sure(change: Change) -> bool:
+    chance = change.false_alarm_probability
+    return chance is not None and chance < SURE
 
 
 def _opacity(plan: FloorPlan, ratio: PowerRatio) -> FloatArray | None:

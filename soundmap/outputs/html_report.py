@@ -126,10 +126,13 @@ def _run_facts(report: Mapping[str, Any]) -> list[tuple[str, str, bool]]:
     way, rows = report["trajectory"], report["sources"]
     lost = sum(loss["data_lost"] for loss in report["losses"])
     share = way["usable_share"]
-    level = number_text(rows[0]["power_db"], 1) if rows else NOTHING
+    unit = printed_reference(report["level_reference"])
+    loudest = (
+        (number_text(rows[0]["power_db"], 1), f"{unit}, loudest source", False) if rows else None
+    )
     return [
-        (level, printed_reference(report["level_reference"]) + ", loudest source", False),
-        (str(len(rows)), "sources", False),
+        *([loudest] if loudest else []),
+        (str(len(rows) or "none"), "source" if len(rows) == 1 else "sources", False),
         (
             NOTHING if share is None else f"{100 * share:.1f} %",
             "of the poses can be trusted",

@@ -33,8 +33,8 @@ def audio_scan_figure(run: Run) -> Figure:
     scans = run.scans
     figure = Figure(figsize=(WIDTH, HEIGHT), dpi=DOTS_PER_INCH)
     FigureCanvasAgg(figure)
-    upper = figure.add_axes((0.10, 0.45, 0.76, 0.48))
-    lower = figure.add_axes((0.10, 0.15, 0.76, 0.26), sharex=upper)
+    upper = figure.add_axes((0.13, 0.45, 0.71, 0.48))
+    lower = figure.add_axes((0.13, 0.15, 0.71, 0.26), sharex=upper)
     figure.text(
         0.48,
         0.985,
@@ -111,7 +111,7 @@ def _draw_bearings(
         vmax=high,
         interpolation="nearest",
     )
-    bar = figure.add_axes((0.875, 0.45, 0.022, 0.48))
+    bar = figure.add_axes((0.855, 0.45, 0.022, 0.48))
     figure.colorbar(image, cax=bar, label=f"power [{written(scans)}]")
 
 

@@ -114,6 +114,9 @@ def test_what_is_not_significant_is_pale():
     alpha = figure.axes[0].images[-1].get_alpha()
     assert (alpha == 1.0).sum() == 1
     assert set(np.unique(alpha)) == {0.3, 1.0}
+    opaque = {c.get_label(): c.get_facecolor()[0, 3] for c in figure.axes[0].collections}
+    assert opaque["appeared"] == opaque["louder"] == 1.0
+    assert opaque["unchanged"] == 0.3
     plain = power_ratio_figure(ratio, room=None, title="a against b")
     assert plain.axes[0].images[-1].get_alpha() is None
 

@@ -62,3 +62,18 @@ def test_the_time_without_a_trusted_pose_is_shaded():
     assert (start, end) == pytest.approx((9.95, 12.0))
     lower = audio_scan_figure(run).axes[1]
     assert "robot not localized" in lower.get_legend_handles_labels()[1]
+
+
+def test_long_numbers_at_the_colour_bar_stay_inside_the_picture():
+    time_ns = START_NS + np.arange(50) * 100_000_000
+    rng = np.random.default_rng(2)
+    power = (1e-10 * rng.uniform(0.6, 1.0, (50, 8))).astype(np.float32)
+    scans = AudioScans(time_ns, np.arange(8) * np.pi / 4, power, LevelReference.FULL_SCALE)
+    figure = audio_scan_figure(replace(made_run(), scans=scans))
+    figure.canvas.draw()
+    for axes in figure.axes:
+        box = axes.get_tightbbox()
+        assert box.x0 >= 0
+        assert box.x1 <= figure.bbox.x1
+        assert box.y0 >= 0
+        assert box.y1 <= figure.bbox.y1
