@@ -160,7 +160,7 @@ def _calibrated(
     if scans.sharp is None:
         return scans, array, None
     found = array_offsets(
-        scans.sharp, scans.time_ns, trajectory, array.mount, config.scan, config.calibrate
+        scans.sharp, scans.time_ns, trajectory, array, config.scan, config.calibrate
     )
     mount = array.mount.turned(found.yaw.correction)
     time_ns = scans.time_ns + round(found.clock.correction * 1e9)

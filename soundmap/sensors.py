@@ -161,9 +161,10 @@ class ArrayOffsets:
     yaw : Offset
         Of the array's direction, counter-clockwise seen from above [rad].
     explained : float
-        Share of what was heard, by the information it holds, that comes from fixed places.
+        Share of what was heard, by the information it holds, that comes from fixed places; on
+        those stretches of the way where it is enough, if there are any.
     places : int
-        Fixed places heard, sources and mirror images, each counted once a stretch of the way.
+        Fixed places heard there, sources and mirror images, each counted once a stretch.
     why : str
         Why something cannot be told, in a sentence's part; empty if both can.
     """

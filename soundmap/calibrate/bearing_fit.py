@@ -34,7 +34,7 @@ GATE = 3.0
 """Residuals of so many standard deviations or more have no weight (Tukey's biweight)."""
 DRIFT_RAD, DRIFT_OVER_M = np.radians(0.8), 0.4
 """Standard deviation of a drift, and the way over which it changes."""
-UNRESOLVED_RAD, UNRESOLVED_SIGMAS = np.radians(8.0), 4.0
+UNRESOLVED_RAD, UNRESOLVED_SIGMAS = np.radians(8.0), 2.0
 """Peaks of places nearer in bearing than this are one: their bearings are the less certain."""
 NEAREST_M, GREATEST_STEP_M = 0.4, 0.5
 PLACE_DAMPING = 65.0
@@ -75,8 +75,8 @@ class BearingFit:
         Of both.
     stretches : tuple of Stretch
         With the places found.
-    explained : float
-        Share of the peaks, by the information they hold, that come from the fixed places.
+    information : ndarray, shape (len(stretches), 2)
+        That the peaks of each stretch hold: of those that come from its fixed places, and of all.
     spread : ndarray, shape (2,)
         Standard deviation of both by the jackknife over the places [s, rad]: what a place whose
         sound is mixed with another's may do; nought for a single one.
@@ -85,8 +85,20 @@ class BearingFit:
     state: FloatArray
     covariance: FloatArray
     stretches: tuple[Stretch, ...]
-    explained: float
+    information: FloatArray
     spread: FloatArray
+
+    @property
+    def explained(self) -> float:
+        """Share of what was heard, by the information it holds, that comes from fixed places."""
+        told, held = self.information.sum(axis=0)
+        return float(told / max(held, 1e-12))
+
+    def where_explained(self, least: float) -> BearingFit:
+        """The fit with those stretches alone where that share is so great or more."""
+        chosen = self.information[:, 0] >= least * self.information[:, 1]
+        stretches = tuple(s for s, good in zip(self.stretches, chosen, strict=True) if good)
+        return replace(self, stretches=stretches, information=self.information[chosen])
 
 
 WayAt = Callable[[float], Way]
@@ -101,13 +113,13 @@ def rigid_fit(
     for round_ in range(ROUNDS):
         gate = GATE * WIDEST ** max(0.0, 1.0 - round_ / NARROWING_ROUNDS)
         way = way_at(float(at[0]))
-        blocks, explained = [], np.zeros(2)
+        blocks, explained = [], []
         for stretch in stretches:
             seen = _seen(peaks, way, stretch, float(at[1]))
             information = seen.sigma_rad**-2
             weight = information * _biweight(seen.error_rad / (gate * seen.sigma_rad))
             near = np.sqrt(_biweight(seen.error_rad / (GATE * seen.sigma_rad)))
-            explained += information @ near, information.sum()
+            explained.append((float(information @ near), float(information.sum())))
             blocks.append(
                 [
                     _block(seen, weight, np.flatnonzero(seen.place == k))
@@ -119,15 +131,17 @@ def rigid_fit(
         at = np.clip(at + step, -FARTHEST, FARTHEST)
         if round_ > NARROWING_ROUNDS and np.all(np.abs(step) < SETTLED):
             break
-    share = float(explained[0] / max(explained[1], 1e-12))
-    return BearingFit(at, covariance, stretches, share, np.zeros(2))
+    return BearingFit(at, covariance, stretches, np.array(explained), np.zeros(2))
 
 
 def drifting_fit(peaks: Peaks, way_at: WayAt, fit: BearingFit) -> BearingFit:
     """The same with drifts, from where the rigid fit ended."""
     at, stretches = fit.state, fit.stretches
     driven = way_at(float(at[0])).driven_m() / DRIFT_OVER_M
-    knots = [_Knots.over(driven[peaks.scan[s.first : s.last]]) for s in stretches]
+    knots = [
+        _Knots.over(driven[peaks.scan[s.first : s.last]], (peaks.blur * DRIFT_RAD) ** -2)
+        for s in stretches
+    ]
     drifts = [np.zeros((len(s.place_m), k.count)) for s, k in zip(stretches, knots, strict=True)]
     for round_ in range(DRIFT_ROUNDS):
         way = way_at(float(at[0]))
@@ -136,8 +150,9 @@ def drifting_fit(peaks: Peaks, way_at: WayAt, fit: BearingFit) -> BearingFit:
             seen = _seen(peaks, way, stretch, float(at[1]))
             error = seen.error_rad - knot.between(drift, seen.place)
             sigma = seen.sigma_rad
-            sigma = np.where(seen.gap_rad < UNRESOLVED_RAD, UNRESOLVED_SIGMAS * sigma, sigma)
-            scale = sigma if round_ else np.hypot(sigma, DRIFT_RAD)
+            unresolved = seen.gap_rad < peaks.blur * UNRESOLVED_RAD
+            sigma = np.where(unresolved, UNRESOLVED_SIGMAS * sigma, sigma)
+            scale = sigma if round_ else np.hypot(sigma, peaks.blur * DRIFT_RAD)
             weight = sigma**-2 * _biweight(error / (GATE * scale))
             seen = replace(seen, error_rad=error)
             blocks.append(
@@ -155,7 +170,7 @@ def drifting_fit(peaks: Peaks, way_at: WayAt, fit: BearingFit) -> BearingFit:
         at = np.clip(at + step, -FARTHEST, FARTHEST)
         if np.all(np.abs(step) < SETTLED):
             break
-    return BearingFit(at, covariance, stretches, fit.explained, _leaving_one_out(blocks))
+    return BearingFit(at, covariance, stretches, fit.information, _leaving_one_out(blocks))
 
 
 @dataclass(frozen=True)
@@ -200,19 +215,21 @@ def _biweight(ratio: FloatArray) -> FloatArray:
 class _Knots:
     """Drifts are told at knots along the way, linear between them.
 
-    ``left`` (P,) is the knot before each peak, ``share`` (P,) how far it is on to the next.
+    ``left`` (P,) is the knot before each peak, ``share`` (P,) how far it is on to the next; the
+    ``prior`` holds each drift to nought [1/rad^2].
     """
 
     count: int
     left: NDArray[np.int64]
     share: FloatArray
+    prior: float
 
     @classmethod
-    def over(cls, along: FloatArray) -> _Knots:
+    def over(cls, along: FloatArray, prior: float) -> _Knots:
         """For peaks that are so many knots' distances along the way."""
         along = along - along.min(initial=np.inf) if len(along) else along
         left = along.astype(np.int64)
-        return cls(int(left.max(initial=0)) + 2, left, along - left)
+        return cls(int(left.max(initial=0)) + 2, left, along - left, prior)
 
     def between(self, drift: FloatArray, place: NDArray[np.int64]) -> FloatArray:
         """Drift of each peak, from those of its place at the knots."""
@@ -255,8 +272,8 @@ def _block(
     columns, prior, bias = seen.by_place[own], np.full(2, PLACE_DAMPING), np.zeros(2)
     if knots is not None and drift is not None:
         columns = np.hstack([columns, knots.columns(own)])
-        prior = np.concatenate([prior, np.full(knots.count, DRIFT_RAD**-2)])
-        bias = np.concatenate([bias, drift * DRIFT_RAD**-2])
+        prior = np.concatenate([prior, np.full(knots.count, knots.prior)])
+        bias = np.concatenate([bias, drift * knots.prior])
     common, weight, error = seen.by_state[own], weight[own], seen.error_rad[own]
     weighted = columns * weight[:, None]
     coupling = weighted.T @ common

@@ -7,25 +7,27 @@ the sources leave a result too uncertain to be of use.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from soundmap.calibrate.bearing_fit import BearingFit, Stretch, WayAt, drifting_fit, rigid_fit
-from soundmap.calibrate.peaks import Peaks, clear_peaks
+from soundmap.calibrate.peaks import Peaks, beam_blur, clear_peaks
 from soundmap.calibrate.search import ballot, fixed_places, starting_points
 from soundmap.calibrate.way import Way, array_way, moved_apart
 from soundmap.config import CalibrateConfig, ScanConfig
-from soundmap.geometry import FloatArray, Mount, Trajectory
-from soundmap.sensors import ArrayOffsets, Offset, OffsetVerdict
+from soundmap.geometry import FloatArray, Trajectory
+from soundmap.sensors import ArrayOffsets, MicArray, Offset, OffsetVerdict
 
 LEAST_SCANS = 40
-STRETCH_M, STRETCH_SCANS = 15.0, 400
-"""Places are sought on stretches of the way of this length, and no more scans."""
+STRETCH_M, STRETCH_SCANS, MOST_STRETCHES = 15.0, 400, 20
+"""Places are sought on stretches of the way of this length and no more scans; on so many."""
 MARGIN_NS = 250_000_000
 """Poses are needed so long before and after a scan."""
 LEAST_EXPLAINED = 0.7
+"""Stretches on which less of what was heard comes from fixed places tell nothing."""
 EQUAL_SHARE = 0.02
 """Fits that explain this much less than the best still count as equal to it."""
 SYSTEMATIC = np.array([0.0015, np.radians(0.2)])
@@ -41,7 +43,7 @@ def array_offsets(
     sharp: NDArray[np.float32],
     time_ns: NDArray[np.int64],
     trajectory: Trajectory,
-    mount: Mount,
+    array: MicArray,
     scan: ScanConfig,
     calibrate: CalibrateConfig,
 ) -> ArrayOffsets:
@@ -55,95 +57,99 @@ def array_offsets(
         Middle of each scan, by the audio's clock.
     trajectory : Trajectory
         Base in the map frame.
-    mount : Mount
-        Array in the base frame, as believed.
+    array : MicArray
+        With its mount as believed.
     scan : ScanConfig
     calibrate : CalibrateConfig
     """
     span_s = (scan.frames - 1) * scan.hop_s + scan.window_s
+
+    def way(scans: NDArray[np.int64], clock_s: float = 0.0) -> Way:
+        times = time_ns[scans]
+        return array_way(trajectory, times, array.mount, clock_s=clock_s, span_s=span_s)
+
     usable = trajectory.usable_at(time_ns - MARGIN_NS) & trajectory.usable_at(time_ns + MARGIN_NS)
-    usable &= np.isfinite(sharp).all(axis=1)
-    sharp, time_ns = sharp[usable], time_ns[usable]
-
-    def way_at(clock_s: float) -> Way:
-        return array_way(trajectory, time_ns, mount, clock_s=clock_s, span_s=span_s)
-
-    if len(time_ns):
-        apart = moved_apart(way_at(0.0), time_ns)
-        sharp, time_ns = sharp[apart], time_ns[apart]
-    if len(time_ns) < LEAST_SCANS:
+    scans = np.flatnonzero(usable & np.isfinite(sharp).all(axis=1))
+    scans = scans[moved_apart(way(scans), time_ns[scans])]
+    if len(scans) < LEAST_SCANS:
         return _nothing("too few audio scans with a trusted pose")
-    peaks = _seen_from_above(clear_peaks(sharp), mount.handedness)
-    fits = _fits(peaks, way_at)
+    spans = _stretches(way(scans))
+    scans = np.concatenate([scans[first:last] for first, last in spans])
+    ends = np.cumsum([0, *(last - first for first, last in spans)])
+    blur = beam_blur(array.positions_m, sharp.shape[1], low_hz=scan.low_hz, high_hz=scan.high_hz)
+    peaks = clear_peaks(sharp[scans], blur=blur)
+    # An array that hangs upside down has bearings that run clockwise seen from above.
+    peaks = replace(peaks, bearing_rad=array.mount.handedness * peaks.bearing_rad)
+    fits = _fits(peaks, lambda clock_s: way(scans, clock_s), ends)
     if not fits:
         return _nothing("no fixed place was heard")
     best = max(fits, key=lambda fit: fit.explained)
     equal = [fit.state for fit in fits if fit.explained > best.explained - EQUAL_SHARE]
     doubt = 0.5 * np.ptp(np.array(equal), axis=0)
-    final = drifting_fit(peaks, way_at, best)
+    clear = best.where_explained(LEAST_EXPLAINED)
+    if not clear.stretches:
+        return _nothing(
+            f"only {best.explained:.0%} of what was heard comes from fixed places "
+            f"({LEAST_EXPLAINED:.0%} is needed)",
+            best.explained,
+        )
+    final = drifting_fit(peaks, lambda clock_s: way(scans, clock_s), clear)
     mixed = final.spread * YAW_ALONE
     sigma = np.sqrt(np.diag(final.covariance) + SYSTEMATIC**2 + doubt**2 + mixed**2)
     return _judged(final, sigma, correct=calibrate.mode == "correct")
 
 
-def _seen_from_above(peaks: Peaks, handedness: int) -> Peaks:
-    """Peaks with bearings that run counter-clockwise, also of an array that hangs upside down."""
-    return Peaks(peaks.scan, handedness * peaks.bearing_rad, peaks.contrast)
-
-
-def _fits(peaks: Peaks, way_at: WayAt) -> list[BearingFit]:
-    """A rigid fit from each of the most promising starts."""
+def _fits(peaks: Peaks, way_at: WayAt, ends: NDArray[np.int64]) -> list[BearingFit]:
+    """A rigid fit from each of the most promising starts; stretches end before these scans."""
     way = way_at(0.0)
-    spans = _stretches(way)
-    limits = [np.searchsorted(peaks.scan, ends) for ends in spans]
-    ballots = [ballot(way, peaks, first, last) for first, last in spans]
+    limits = np.searchsorted(peaks.scan, ends).tolist()
+    ballots = [ballot(way, peaks, first, last) for first, last in pairwise(ends.tolist())]
     fits = []
     for clock_s, yaw_rad in starting_points(ballots):
-        stretches = tuple(
-            Stretch(int(first), int(last), fixed_places(votes, clock_s, yaw_rad))
-            for (first, last), votes in zip(limits, ballots, strict=True)
-        )
-        stretches = tuple(s for s in stretches if len(s.place_m) and s.last > s.first)
+        stretches = [
+            Stretch(first, last, fixed_places(votes, clock_s, yaw_rad))
+            for (first, last), votes in zip(pairwise(limits), ballots, strict=True)
+        ]
+        stretches = [s for s in stretches if len(s.place_m) and s.last > s.first]
         if stretches:
             fits.append(rigid_fit(peaks, way_at, stretches, (clock_s, yaw_rad)))
     return fits
 
 
 def _stretches(way: Way) -> list[tuple[int, int]]:
-    """First and one past the last scan of each stretch of the way, all about as long."""
+    """First and one past the last scan of stretches of the way, all about as long.
+
+    Of a long run, so many as suffice, spread over all of it.
+    """
     driven = way.driven_m()
     count = max(1, round(driven[-1] / STRETCH_M), -(-len(way) // STRETCH_SCANS))
     along = np.arange(len(way)) / len(way) + driven / max(driven[-1], 1e-9)
     ends = np.searchsorted(along, np.linspace(0.0, 2.0, count + 1))
     ends[-1] = len(way)
-    return [(int(a), int(b)) for a, b in pairwise(ends) if b > a]
+    spans = [(int(a), int(b)) for a, b in pairwise(ends) if b > a]
+    chosen = np.linspace(0, len(spans) - 1, min(len(spans), MOST_STRETCHES)).round().astype(int)
+    return [spans[index] for index in chosen]
 
 
 def _judged(fit: BearingFit, sigma: FloatArray, *, correct: bool) -> ArrayOffsets:
-    why = ""
-    if fit.explained < LEAST_EXPLAINED:
-        why = (
-            f"only {fit.explained:.0%} of what was heard comes from fixed places "
-            f"({LEAST_EXPLAINED:.0%} is needed)"
-        )
     clock, yaw = (
-        _offset(float(value), float(spread), float(useful), told=not why, correct=correct)
+        _offset(float(value), float(spread), float(useful), correct=correct)
         for value, spread, useful in zip(fit.state, sigma, USEFUL, strict=True)
     )
-    if not why and OffsetVerdict.UNKNOWN in (clock.verdict, yaw.verdict):
-        why = "turns and sources along the way leave it too uncertain"
+    uncertain = OffsetVerdict.UNKNOWN in (clock.verdict, yaw.verdict)
+    why = "turns and sources along the way leave it too uncertain" if uncertain else ""
     places = sum(len(stretch.place_m) for stretch in fit.stretches)
     return ArrayOffsets(clock, yaw, fit.explained, places, why)
 
 
-def _offset(value: float, sigma: float, useful: float, *, told: bool, correct: bool) -> Offset:
-    if not told or sigma > useful:
+def _offset(value: float, sigma: float, useful: float, *, correct: bool) -> Offset:
+    if sigma > useful:
         return Offset(value, sigma, OffsetVerdict.UNKNOWN)
     if abs(value) <= CLEAR_SIGMAS * sigma:
         return Offset(value, sigma, OffsetVerdict.NOUGHT)
     return Offset(value, sigma, OffsetVerdict.CORRECTED if correct else OffsetVerdict.CLEAR)
 
 
-def _nothing(why: str) -> ArrayOffsets:
+def _nothing(why: str, explained: float = 0.0) -> ArrayOffsets:
     unknown = Offset(np.nan, np.nan, OffsetVerdict.UNKNOWN)
-    return ArrayOffsets(unknown, unknown, 0.0, 0, why)
+    return ArrayOffsets(unknown, unknown, explained, 0, why)

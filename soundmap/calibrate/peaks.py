@@ -15,6 +15,8 @@ LEAST_OF_STRONGEST = 0.2
 """... and by this share of what the strongest peak of its scan does: side lobes do not."""
 SIGMA_RAD, SIGMA_AT_CONTRAST_1_RAD = np.radians(0.4), np.radians(0.6)
 """Error of a peak's bearing, as seen on simulated sites: of a clear one, and of a faint one."""
+SEEN_WITH_M_HZ, SEEN_WITH_SPACING_RAD = 0.155 * 4677.0, np.radians(3.0)
+"""Array, radius times frequency, and bearings for which these hold; wider beams err more."""
 
 
 @dataclass(frozen=True)
@@ -29,11 +31,14 @@ class Peaks:
         In the array's frame [rad].
     contrast : ndarray, shape (P,)
         How far it stands out from the median over the bearings, over that median [-].
+    blur : float
+        Width of the array's beam over that of a ring of 31 cm between 1 and 6 kHz [-].
     """
 
     scan: NDArray[np.int64]
     bearing_rad: FloatArray
     contrast: FloatArray
+    blur: float = 1.0
 
     def __len__(self) -> int:
         return len(self.scan)
@@ -41,16 +46,36 @@ class Peaks:
     @property
     def sigma_rad(self) -> FloatArray:
         """Standard deviation of each bearing, but for what its place adds [rad], shape (P,)."""
-        return np.hypot(SIGMA_RAD, SIGMA_AT_CONTRAST_1_RAD / self.contrast)
+        return self.blur * np.hypot(SIGMA_RAD, SIGMA_AT_CONTRAST_1_RAD / self.contrast)
 
 
-def clear_peaks(sharp: NDArray[np.float32]) -> Peaks:
+def beam_blur(positions_m: FloatArray, bearings: int, *, low_hz: float, high_hz: float) -> float:
+    """How wide the beam of an array is in a sharp scan; see `Peaks.blur`.
+
+    Examples
+    --------
+    >>> angle = 2.0 * np.pi * np.arange(8) / 8
+    >>> ring = 0.0775 * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=-1)
+    >>> round(beam_blur(ring, 120, low_hz=1000.0, high_hz=6000.0), 2)
+    2.0
+    """
+    centred = positions_m[:, :2] - positions_m[:, :2].mean(axis=0)
+    radius = float(np.sqrt(np.mean(np.sum(centred**2, axis=1))))
+    frequency = np.linspace(low_hz, high_hz, 100)
+    mean_hz = float(np.sqrt(np.sum(frequency**4) / np.sum(frequency**2)))
+    spacing = 2.0 * np.pi / bearings
+    return max(1.0, SEEN_WITH_M_HZ / (radius * mean_hz), spacing / SEEN_WITH_SPACING_RAD)
+
+
+def clear_peaks(sharp: NDArray[np.float32], *, blur: float = 1.0) -> Peaks:
     """The peaks that stand out.
 
     Parameters
     ----------
     sharp : ndarray of float32, shape (S, N)
         Of each scan on the bearings 2 pi n / N, as `AudioScan.sharp`.
+    blur : float
+        Of the array.
 
     Examples
     --------
@@ -72,4 +97,4 @@ def clear_peaks(sharp: NDArray[np.float32]) -> Peaks:
     clear &= floor[scan] > 0.0
     scan, above = scan[clear], above[clear]
     angle = (bearing[clear] + offset[clear]) * 2.0 * np.pi / power.shape[1]
-    return Peaks(scan.astype(np.int64), angle % (2.0 * np.pi), above / floor[scan])
+    return Peaks(scan.astype(np.int64), angle % (2.0 * np.pi), above / floor[scan], blur)

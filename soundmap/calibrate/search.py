@@ -33,7 +33,7 @@ MOST_SCANS = 150
 MOST_PLACES = 6
 LEAST_VOTES = 0.05
 """A fixed place has this share of all full votes or more."""
-OWN_BINS = 8
+OWN_RAD = np.radians(12.0)
 """Peaks this near to the bearing of a place are its own."""
 
 
@@ -45,16 +45,19 @@ class Ballot:
     ----------
     cell_m : ndarray, shape (C, 2)
         In the map frame.
-    direction : ndarray of int32, shape (C, S)
+    direction : ndarray of int16, shape (C, S)
         Of each cell from each scan, in the array's axes, in steps of 2 pi / `DIRECTIONS`.
     turn_rad_s : ndarray, shape (S,)
     votes : ndarray of float32, shape (S, DIRECTIONS)
+    own_bins : int
+        Votes this near to the direction of a place are its own.
     """
 
     cell_m: FloatArray
-    direction: NDArray[np.int32]
+    direction: NDArray[np.int16]
     turn_rad_s: FloatArray
     votes: NDArray[np.float32]
+    own_bins: int
 
     def shift(self, clock_s: float, yaw_rad: float) -> NDArray[np.int32]:
         """Steps by which directions move if clock and yaw are off; parallax is left out."""
@@ -77,12 +80,13 @@ def ballot(way: Way, peaks: Peaks, first: int, last: int) -> Ballot:
     inside = (peaks.scan >= first) & (peaks.scan < last)
     inside[inside] = row[peaks.scan[inside]] >= 0
     centre = (np.arange(DIRECTIONS) + 0.5) * 2.0 * np.pi / DIRECTIONS
-    away = wrapped_angle(centre - peaks.bearing_rad[inside, None]) / VOTE_RAD
+    away = wrapped_angle(centre - peaks.bearing_rad[inside, None]) / (peaks.blur * VOTE_RAD)
     weight = np.minimum(peaks.contrast[inside] / FULL_CONTRAST, 1.0)
     votes = np.zeros((len(scans), DIRECTIONS), dtype=np.float32)
     cast = (weight[:, None] * np.exp(-0.5 * away**2)).astype(np.float32)
     np.maximum.at(votes, row[peaks.scan[inside]], cast)
-    return Ballot(cell, direction.astype(np.int32), way.turn_rad_s[scans], votes)
+    own_bins = round(min(peaks.blur * OWN_RAD, np.pi / 2.0) * DIRECTIONS / (2.0 * np.pi))
+    return Ballot(cell, direction.astype(np.int16), way.turn_rad_s[scans], votes, own_bins)
 
 
 def starting_points(ballots: list[Ballot]) -> list[tuple[float, float]]:
@@ -110,7 +114,7 @@ def fixed_places(ballot: Ballot, clock_s: float, yaw_rad: float) -> FloatArray:
     """The places with most votes, shape (K, 2) [m]: each is taken with the votes it explains."""
     shift = ballot.shift(clock_s, yaw_rad)
     votes = ballot.votes.copy()
-    own = np.arange(-OWN_BINS, OWN_BINS + 1)
+    own = np.arange(-ballot.own_bins, ballot.own_bins + 1)
     scans = np.arange(len(votes))[:, None]
     places: list[FloatArray] = []
     while len(places) < MOST_PLACES:

@@ -71,7 +71,8 @@ class Trial:
 
     @property
     def told(self) -> bool:
-        return self.found.explained > 0.0 and OffsetVerdict.UNKNOWN not in (
+        """Whether both can be told."""
+        return OffsetVerdict.UNKNOWN not in (
             self.found.clock.verdict,
             self.found.yaw.verdict,
         )
@@ -125,7 +126,7 @@ def found_offsets(run: Heard) -> tuple[ArrayOffsets, float]:
         run.scans.sharp,
         run.scans.time_ns,
         run.trajectory,
-        run.array.mount,
+        run.array,
         run.config.scan,
         CalibrateConfig(),
     )
@@ -182,8 +183,10 @@ def yaw_error_deg(trial: Trial) -> float:
 
 def described(seed: int, trial: Trial) -> str:
     clock, yaw = trial.found.clock, trial.found.yaw
-    return (
-        f"{seed:>5} {1e3 * trial.clock_s:+6.1f} ms {np.degrees(trial.yaw_rad):+5.2f} deg: "
+    put_in = f"{seed:>5} {1e3 * trial.clock_s:+6.1f} ms {np.degrees(trial.yaw_rad):+5.2f} deg: "
+    if not trial.told:
+        return put_in + f"not told, {trial.found.why}"
+    return put_in + (
         f"off by {clock_error_ms(trial):+6.1f} ms (sigma {1e3 * clock.sigma:4.1f}), "
         f"{yaw_error_deg(trial):+5.2f} deg (sigma {np.degrees(yaw.sigma):4.2f}), "
         f"{trial.found.explained:.2f} explained; {clock.verdict}; {yaw.verdict}"

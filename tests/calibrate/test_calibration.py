@@ -8,10 +8,11 @@ import pytest
 from soundmap.calibrate.calibration import array_offsets
 from soundmap.config import CalibrateConfig, ScanConfig
 from soundmap.geometry import Mount, Trajectory
-from soundmap.sensors import OffsetVerdict
+from soundmap.sensors import MicArray, OffsetVerdict
 
 START_NS = 1_700_000_000_000_000_000
 BEARINGS = 2.0 * np.pi * np.arange(120) / 120
+RING_M = 0.155 * np.array([[1.0, 0, 0], [0, 1.0, 0], [-1.0, 0, 0], [0, -1.0, 0]])
 LEVEL = Mount.planar(0.1, -0.05, 0.5, 0.3)
 HANGING = Mount(LEVEL.rotation @ np.diag([1.0, -1.0, -1.0]), LEVEL.translation_m)
 SOURCES = ((2.0, -1.5, 8.0), (5.5, 2.5, 10.0), (1.0, 4.5, 6.0))
@@ -32,7 +33,7 @@ def drive(legs, speed_m_s=0.5):
     return Trajectory(time_ns, np.column_stack([place, heading]), np.ones(len(heading), dtype=bool))
 
 
-def sharp_scans(way, time_ns, mount, sources, walk_m_s, rng):
+def sharp_scans(way, time_ns, mount, sources, walk_m_s, width, rng):
     """What sources that stand or walk would give, while the array turns during each scan."""
     pose = way.at(time_ns[:, None] + np.linspace(-5e7, 5e7, 11).astype(np.int64))[:, :, None]
     cos, sin = np.cos(pose[..., 2]), np.sin(pose[..., 2])
@@ -43,7 +44,7 @@ def sharp_scans(way, time_ns, mount, sources, walk_m_s, rng):
         walked = np.multiply.outer((time_ns - START_NS) * 1e-9, walk_m_s)[:, None, None]
         away_x = source_x + walked[..., 0] - pose[..., 0] - cos * x + sin * y
         away_y = source_y + walked[..., 1] - pose[..., 1] - sin * x - cos * y
-        lobe = np.exp(80.0 * (np.cos(looking - np.arctan2(away_y, away_x)) - 1.0))
+        lobe = np.exp(80.0 / width**2 * (np.cos(looking - np.arctan2(away_y, away_x)) - 1.0))
         heard += (strength / (away_x**2 + away_y**2) * lobe).mean(axis=1)
     return (0.06 * heard).astype(np.float32)
 
@@ -55,6 +56,7 @@ def offsets_of(
     clock_s=0.0,
     yaw_rad=0.0,
     mount=LEVEL,
+    positions_m=RING_M,
     mode="correct",
     walk_m_s=(0.0, 0.0),
     seed=1,
@@ -63,11 +65,13 @@ def offsets_of(
     way = drive(legs)
     margin_ns, step_ns = 400_000_000, 100_000_000
     true_ns = np.arange(START_NS + margin_ns, way.time_ns[-1] - margin_ns, step_ns)
-    sharp = sharp_scans(way, true_ns, mount, sources, walk_m_s, np.random.default_rng(seed))
+    width, rng = RING_M.max() / positions_m.max(), np.random.default_rng(seed)
+    sharp = sharp_scans(way, true_ns, mount, sources, walk_m_s, width, rng)
     back = Mount.planar(0.0, 0.0, 0.0, -yaw_rad)
     believed = Mount(back.rotation @ mount.rotation, mount.translation_m)
     stamped_ns = true_ns - round(clock_s * 1e9)
-    return array_offsets(sharp, stamped_ns, way, believed, ScanConfig(), CalibrateConfig(mode=mode))
+    array = MicArray(positions_m, believed, None)
+    return array_offsets(sharp, stamped_ns, way, array, ScanConfig(), CalibrateConfig(mode=mode))
 
 
 @pytest.mark.parametrize("mount", [LEVEL, HANGING], ids=["upright", "upside down"])
@@ -107,6 +111,15 @@ def test_one_source_is_enough_if_the_robot_turns_beside_it():
     assert np.degrees(found.yaw.correction) == pytest.approx(5.0, abs=0.5)
 
 
+def test_a_small_array_has_a_wide_beam_and_is_less_sure():
+    small = offsets_of(clock_s=0.08, yaw_rad=np.radians(8.0), positions_m=RING_M / 3.0)
+    large = offsets_of(clock_s=0.08, yaw_rad=np.radians(8.0))
+    assert np.degrees(small.yaw.value) == pytest.approx(8.0, abs=1.0)
+    assert small.clock.value == pytest.approx(0.08, abs=0.015)
+    assert small.yaw.sigma > 1.5 * large.yaw.sigma
+    assert small.clock.sigma > 1.5 * large.clock.sigma
+
+
 def test_without_a_source_nothing_is_said():
     found = offsets_of(sources=())
     assert (found.clock.verdict, found.yaw.verdict) == (OffsetVerdict.UNKNOWN,) * 2
@@ -131,6 +144,13 @@ def test_too_short_a_run_says_so():
     assert found.clock.verdict is OffsetVerdict.UNKNOWN
     assert "too few" in found.why
     assert np.isnan(found.clock.value)
+
+
+def test_a_stretch_where_nothing_is_heard_does_not_hide_what_the_others_tell():
+    legs = (*SERPENTINE, (90.0, 0.0))
+    found = offsets_of(legs, clock_s=0.05, yaw_rad=np.radians(5.0))
+    assert 1e3 * found.clock.correction == pytest.approx(50.0, abs=5.0)
+    assert np.degrees(found.yaw.correction) == pytest.approx(5.0, abs=0.5)
 
 
 def test_a_long_run_is_one_of_many_stretches():
