@@ -21,6 +21,7 @@ from soundmap.outputs.html_findings import (
     sources_table,
 )
 from soundmap.outputs.wording import NOTHING, array_text, number_text, printed_reference
+from soundmap.sensors import OffsetVerdict
 
 KINDS = ("appeared", "louder", "quieter", "gone", "unchanged", "untold")
 CAPTIONS = {
@@ -139,8 +140,21 @@ def _run_facts(report: Mapping[str, Any]) -> list[tuple[str, str, bool]]:
             share is None or share < 0.95,
         ),
         (f"{way['length_m']:.1f} m", f"driven in {number_text(report['duration_s'], 1)} s", False),
+        *_corrections(report.get("array")),
         (str(lost or "none"), "kind of data lost" if lost == 1 else "kinds of data lost", lost > 0),
     ]
+
+
+def _corrections(array: Mapping[str, Any] | None) -> list[tuple[str, str, bool]]:
+    """What was put right about the array's clock and mount, which its owner had better know."""
+    cards = []
+    if array and array["clock_verdict"] == OffsetVerdict.CORRECTED:
+        late = 1e3 * array["clock_offset_s"]
+        cards.append((f"{late:+.0f} ms", "clock of the audio, corrected", True))
+    if array and array["yaw_verdict"] == OffsetVerdict.CORRECTED:
+        turned = array["yaw_offset_deg"]
+        cards.append((f"{turned:+.1f}°", "yaw of the array's mount, corrected", True))
+    return cards
 
 
 def _lead_of_changes(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -222,6 +236,8 @@ def _provenance(report: Mapping[str, Any]) -> str:
         facts["length of the log"] = f"{number_text(report['duration_s'], 1)} s"
     if text := array_text(report.get("array")):
         facts["microphone array"] = text
+    if array := array_text(report.get("array")):
+        facts["array against the rest"] = array
     if report.get("speed") is not None:
         facts["speed"] = f"{report['speed']:.3g} x real time"
     facts["time"] = _joined(

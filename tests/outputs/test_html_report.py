@@ -70,6 +70,13 @@ def test_the_page_tells_what_a_fit_knows():
     assert page.says("Mirror images", "R1", "-80.0")
 
 
+def test_the_page_tells_what_was_put_right_about_the_array():
+    page = page_of(calibrated_run())
+    assert page.says("+50 ms", "clock of the audio, corrected", "yaw -0.3 ± 0.4 degrees")
+    assert not page.says("yaw of the array's mount, corrected")
+    assert not page_of(made_run()).says("clock of the audio")
+
+
 def test_the_page_loads_nothing_but_itself():
     page = page_of(made_run())
     assert page.loads
