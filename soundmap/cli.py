@@ -8,7 +8,7 @@ import signal
 import sys
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
@@ -28,9 +28,6 @@ from soundmap.terminal import (
     resolved_config,
     show_error,
 )
-
-if TYPE_CHECKING:
-    from soundmap.config import Config
 
 EPILOG = """\b
 Examples:
@@ -139,6 +136,15 @@ def process(
             "--rerun", help="Write a recording for the Rerun viewer, too; see soundmap view."
         ),
     ] = False,
+    jobs: Annotated[
+        int,
+        typer.Option(
+            min=1,
+            metavar="N",
+            help="Logs that are processed at a time, each by a process of its own. The results are "
+            "the same.",
+        ),
+    ] = 1,
     force: ForceOption = False,
     strict: Annotated[
         bool,
@@ -155,6 +161,9 @@ def process(
 
     Writes a folder a log: sources, power map, trajectory, pictures, report.
     """
+    from soundmap.jobs import Job
+    from soundmap.jobs import outcomes as job_outcomes
+
     start = parsed_start_pose(start_pose)
     if map_file is None and start is not None:
         raise typer.BadParameter(
@@ -163,26 +172,24 @@ def process(
         )
     folders = _run_folders(logs, out)
     settings = resolved_config(config)
-    outcomes = []
-    for log, folder in zip(logs, folders, strict=True):
-        try:
-            report = _processed(
-                log,
-                folder,
-                map_file,
-                settings,
-                start=start,
-                figures=figures,
-                rerun=rerun,
-                force=force,
-                quiet=quiet or as_json,
-            )
-            outcomes.append({**report, "folder": str(folder)})
-        except SoundmapError as error:
-            if len(logs) == 1:
-                raise
-            show_error(error)
-            outcomes.append({"log": log.name, "error": str(error), "exit_code": error.exit_code})
+    work = [
+        Job(log, folder, map_file, settings, start, figures, rerun=rerun, force=force)
+        for log, folder in zip(logs, folders, strict=True)
+    ]
+    outcomes: list[dict[str, Any]] = [{} for _ in work]
+    for number, outcome in job_outcomes(work, at_a_time=jobs, quiet=quiet or as_json):
+        log, folder = logs[number], folders[number]
+        if not isinstance(outcome, SoundmapError):
+            outcomes[number] = {**outcome, "folder": str(folder)}
+            continue
+        if len(logs) == 1:
+            raise outcome
+        show_error(outcome)
+        outcomes[number] = {
+            "log": log.name,
+            "error": str(outcome),
+            "exit_code": outcome.exit_code,
+        }
     _show_runs(outcomes, quiet=quiet, as_json=as_json)
     _exit_unless_good(outcomes, strict=strict)
 
@@ -240,41 +247,17 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     signal.signal(signal.SIGTERM, _stop)
-    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it tells of its font cache otherwise
+    hush_libraries()
     app(prog_name="soundmap")
+
+
+def hush_libraries() -> None:
+    """Keep the terminal free of what libraries have to say."""
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it tells of its font cache otherwise
 
 
 def _stop(number: int, _frame: object) -> None:
     raise SystemExit(128 + number)
-
-
-def _processed(
-    log: Path,
-    folder: Path,
-    map_file: Path | None,
-    config: Config,
-    *,
-    start: tuple[float, float, float] | None,
-    figures: PictureFormat,
-    rerun: bool,
-    force: bool,
-    quiet: bool,
-) -> dict[str, Any]:
-    """Process one log into its folder and give the report."""
-    from soundmap.outputs.new_folder import new_folder
-    from soundmap.outputs.progress import chosen_progress
-    from soundmap.outputs.run_folder import write_run
-
-    with new_folder(folder, force=force, inputs=[log]) as new:
-        from soundmap.replay import process as processed
-
-        progress = chosen_progress(quiet=quiet)
-        run = processed(log, map_file, config, start_pose=start, progress=progress)
-        if rerun:
-            from soundmap.retelling import recorded
-
-            run = recorded(run, new, progress=progress)
-        return write_run(run, new, figures=figures)
 
 
 def _run_folders(logs: list[Path], out: Path | None) -> list[Path]:

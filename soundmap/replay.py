@@ -8,6 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
+import numba
+
 from soundmap.calibrate.calibration import array_offsets
 from soundmap.config import Config, ScanConfig
 from soundmap.detect.fitted_sources import fitted_sources
@@ -31,8 +33,8 @@ from soundmap.scan.spectrum import band_bins
 from soundmap.sensors import ArrayOffsets, AudioBlock, LaserScan, MicArray
 from soundmap.sound import AudioScans
 
-THREADS = 2
-"""Threads that turn sound into audio scans while the log is read."""
+MOST_THREADS = 4
+"""Threads that turn sound into audio scans; they keep up with any reading of the log."""
 
 
 def process(
@@ -84,7 +86,7 @@ def process(
                 array,
                 config.scan,
                 losses=log.losses,
-                threads=THREADS,
+                threads=min(numba.get_num_threads(), MOST_THREADS),
                 sharp=config.calibrate.mode != "off",
             ),
             reference,

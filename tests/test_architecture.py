@@ -8,7 +8,8 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "soundmap"
 STAGES = {"logs", "mapping", "localize", "scan", "calibrate", "fuse", "detect"}
 COMPOSERS = {
-    "replay", "map_log", "retelling", "comparison", "cli", "cli_map", "cli_runs", "terminal",
+    "replay", "map_log", "retelling", "comparison", "jobs", "cli", "cli_map", "cli_runs",
+    "terminal",
 }  # fmt: skip
 SLOW = {"numba", "scipy", "matplotlib", "rerun", "google"}
 

@@ -143,3 +143,14 @@ def test_the_same_log_gives_the_same_results(runs, tmp_path):
     )  # fmt: skip
     for name in ("sources.csv", "trajectory.tum", "power_map.npz", "audio_scans.npz"):
         assert (tmp_path / "run3" / name).read_bytes() == (runs / "run3" / name).read_bytes(), name
+
+
+def test_two_logs_at_a_time_give_the_same_results(runs, tmp_path):
+    settings = ["--config", PAPER, "--config", LAB / "robot.toml", "--map", LAB / "map.yaml"]
+    soundmap(
+        "process", LAB / "run1.mcap", LAB / "run3.mcap", *settings, "--out", tmp_path, "--quiet",
+        "--jobs", 2,
+    )  # fmt: skip
+    for run in ("run1", "run3"):
+        for name in ("sources.csv", "trajectory.tum", "power_map.npz", "audio_scans.npz"):
+            assert (tmp_path / run / name).read_bytes() == (runs / run / name).read_bytes(), name
