@@ -15,6 +15,7 @@ from typer.core import TyperGroup
 
 from soundmap import __version__, cli_map, cli_runs
 from soundmap.errors import DataLossError, SoundmapError
+from soundmap.kernel_cache import kernel_cache_folder
 from soundmap.outputs.picture_format import PictureFormat
 from soundmap.terminal import (
     ConfigOption,
@@ -246,6 +247,12 @@ def main() -> None:
     # several-fold to their waiting for one another. Read when numpy is first imported.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    home = os.path.expanduser("~")
+    folder = kernel_cache_folder(
+        Path(__file__).parent, os.environ, Path(home) if os.path.isabs(home) else None
+    )
+    if folder is not None:
+        os.environ["NUMBA_CACHE_DIR"] = str(folder)
     signal.signal(signal.SIGTERM, _stop)
     hush_libraries()
     app(prog_name="soundmap")
