@@ -60,7 +60,7 @@ def beam_blur(positions_m: FloatArray, bearings: int, *, low_hz: float, high_hz:
     2.0
     """
     centred = positions_m[:, :2] - positions_m[:, :2].mean(axis=0)
-    radius = float(np.sqrt(np.mean(np.sum(centred**2, axis=1))))
+    radius = max(float(np.sqrt(np.mean(np.sum(centred**2, axis=1)))), 1e-3)
     frequency = np.linspace(low_hz, high_hz, 100)
     mean_hz = float(np.sqrt(np.sum(frequency**4) / np.sum(frequency**2)))
     spacing = 2.0 * np.pi / bearings

@@ -236,8 +236,6 @@ def _provenance(report: Mapping[str, Any]) -> str:
         facts["length of the log"] = f"{number_text(report['duration_s'], 1)} s"
     if text := array_text(report.get("array")):
         facts["microphone array"] = text
-    if array := array_text(report.get("array")):
-        facts["array against the rest"] = array
     if report.get("speed") is not None:
         facts["speed"] = f"{report['speed']:.3g} x real time"
     facts["time"] = _joined(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -59,6 +61,7 @@ def offsets_of(
     positions_m=RING_M,
     mode="correct",
     walk_m_s=(0.0, 0.0),
+    trusted=True,
     seed=1,
 ):
     """What is estimated if the audio's stamps are `clock_s` early and the mount `yaw_rad` off."""
@@ -71,6 +74,7 @@ def offsets_of(
     believed = Mount(back.rotation @ mount.rotation, mount.translation_m)
     stamped_ns = true_ns - round(clock_s * 1e9)
     array = MicArray(positions_m, believed, None)
+    way = replace(way, usable=np.full(len(way), trusted))
     return array_offsets(sharp, stamped_ns, way, array, ScanConfig(), CalibrateConfig(mode=mode))
 
 
@@ -144,6 +148,12 @@ def test_too_short_a_run_says_so():
     assert found.clock.verdict is OffsetVerdict.UNKNOWN
     assert "too few" in found.why
     assert np.isnan(found.clock.value)
+
+
+def test_a_run_without_a_trusted_pose_says_so():
+    found = offsets_of(trusted=False)
+    assert found.yaw.verdict is OffsetVerdict.UNKNOWN
+    assert "trusted pose" in found.why
 
 
 def test_a_stretch_where_nothing_is_heard_does_not_hide_what_the_others_tell():
