@@ -21,9 +21,10 @@ REST_M, REST_RAD = 0.04, 0.02
 MOST_MERGED = 20
 LARGEST_WEIGHT = 4.0
 """However long the robot rests, a place counts no more than this many scans."""
-MOST_SCANS = 1200
+LONG_RUN_SCANS = 1200
 """In longer runs, scans from nearly the same pose are one whenever they were taken."""
 SAME_M, SAME_RAD = 0.12, np.radians(10.0)
+SCANS_AT_ONCE = 4000
 MOST_TURN_RAD = np.radians(12.0)
 
 
@@ -129,7 +130,7 @@ def gathered_evidence(
     place = transformed(base, np.broadcast_to(mount.translation_m[:2], (len(base), 2)))
     axis = np.asarray(wrapped_angle(heading + mount.yaw_rad))
     group = _rests(place, axis)
-    if len(group) and group[-1] >= MOST_SCANS:
+    if len(group) and group[-1] >= LONG_RUN_SCANS:
         group = _same_poses(place, axis)
     first, count = _firsts(group)
     mean = parts[chosen].mean(axis=2, dtype=np.float64)
@@ -140,7 +141,11 @@ def gathered_evidence(
         waves=range_m.shape[1],
         speed_of_sound_m_s=config.speed_of_sound_m_s,
     )
-    heard = _means(table.harmonics(parts[chosen]), group, count)
+    heard = np.zeros((len(count), table.beams.shape[2]))
+    for start in range(0, len(chosen), SCANS_AT_ONCE):
+        block = slice(start, start + SCANS_AT_ONCE)
+        np.add.at(heard, group[block], table.harmonics(parts[chosen[block]]))
+    heard /= count[:, None]
     weight = np.sqrt(np.minimum(count, LARGEST_WEIGHT))[:, None]
     weight = weight / (RELATIVE_NOISE * _means(mean, group, count))
     return Evidence(

@@ -29,8 +29,10 @@ from soundmap.detect.candidates import candidate_places
 from soundmap.detect.evidence import Evidence, gathered_evidence
 from soundmap.detect.growth import grown_fit
 from soundmap.detect.harmonics import Single
+from soundmap.detect.matched_filter import effective_number
 from soundmap.detect.placement import Placement, placement, surface_odds
 from soundmap.detect.reflections import told_reflections
+from soundmap.detect.regions import Region, regions
 from soundmap.detect.significance import (
     chance_distribution,
     chance_probabilities,
@@ -95,35 +97,50 @@ def fitted_sources(
         Empty if nothing is told from chance.
     """
     evidence = gathered_evidence(scans, around_m, trajectory, array, scan)
-    none = SourceList((), scans.reference)
     if len(evidence) < LEAST_SCANS:
-        return none
+        return SourceList((), scans.reference)
+    found: list[Source] = []
+    images: list[tuple[Evidence, Component]] = []
+    for region in regions(evidence):
+        if len(region.evidence) >= LEAST_SCANS:
+            sources, mirrored = _found(region, room, detect.false_alarm_rate)
+            found += sources
+            images += [(region.evidence, image) for image in mirrored]
+    found.sort(key=lambda source: -source.power)
+    return SourceList(tuple(found), scans.reference, told_reflections(images, found))
+
+
+def _found(
+    region: Region, room: OccupancyGrid | None, rate: float
+) -> tuple[list[Source], list[Component]]:
+    """Sources and mirror images that lie in a region."""
+    evidence = region.evidence
     surface = surface_points(evidence)
     candidates = candidate_places(evidence, surface)
     fit = grown_fit(evidence, wall_lines(surface), candidates)
     if not fit.components:
-        return none
+        return [], []
     told = _told(fit, surface, surface_odds(surface, room))
     chance = chance_distribution(fit, candidates, _stretches(evidence))
     gains = np.array([each.gain for each in told])
     on_surface = np.array([each.placement.on_surface for each in told])
     probability = _by_index(told, false_alarm_probabilities(gains, on_surface, chance))
     by_chance = _by_index(told, chance_probabilities(gains, chance))
-    chosen = [
-        each
+    sources = [
+        _source(fit, each, probability[each.index])
         for each in _strongest_apart(told)
-        if each.component.kind == Kind.SOURCE
-        and probability[each.index] <= detect.false_alarm_rate
-        and _behind(each.component) <= FARTHEST_BEHIND_M
+        if probability[each.index] <= rate
+        and _heard_in_view(each.component)
+        and region.owns(each.placement.place_m)
     ]
-    chosen.sort(key=lambda each: -float(each.component.strength.sum()))
-    sources = tuple(_source(fit, each, probability[each.index]) for each in chosen)
     images = [
         each.component
         for each in told
-        if each.component.kind == Kind.IMAGE and by_chance[each.index] <= detect.false_alarm_rate
+        if each.component.kind == Kind.IMAGE
+        and by_chance[each.index] <= rate
+        and region.owns(each.component.place_m)
     ]
-    return SourceList(sources, scans.reference, told_reflections(evidence, images, sources))
+    return sources, images
 
 
 def _told(fit: SparseFit, surface_m: FloatArray, odds: FloatArray) -> list[_Told]:
@@ -159,16 +176,15 @@ def _strongest_apart(told: Sequence[_Told]) -> list[_Told]:
     return kept
 
 
-def _behind(component: Component) -> float:
-    """How far behind the first surface a component lies, on average over what is heard of it [m].
-
-    Negative in front of it; 0 where no surface is known.
-    """
-    weight = component.paths.gain[Path.DIRECT] ** 2
-    known = np.isfinite(component.paths.beyond_m) & (weight > 0.0)
+def _heard_in_view(component: Component) -> bool:
+    """Whether enough scans hear a source directly, and it does not lie behind what they see."""
+    gain, beyond = component.paths.gain[Path.DIRECT], component.paths.beyond_m
+    if effective_number(gain) < LEAST_SCANS:
+        return False
+    known = np.isfinite(beyond) & (gain > 0.0)
     if not known.any():
-        return 0.0
-    return float(np.average(component.paths.beyond_m[known], weights=weight[known]))
+        return True
+    return float(np.average(beyond[known], weights=gain[known] ** 2)) <= FARTHEST_BEHIND_M
 
 
 def _source(fit: SparseFit, told: _Told, probability: float) -> Source:

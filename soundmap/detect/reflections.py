@@ -15,10 +15,17 @@ TOLERANCE_M = 0.35
 
 
 def told_reflections(
-    evidence: Evidence, images: Sequence[Component], sources: Sequence[Source]
+    images: Sequence[tuple[Evidence, Component]], sources: Sequence[Source]
 ) -> tuple[Reflection, ...]:
-    """Mirror images with the source that each belongs to, loudest first."""
-    loudest_first = sorted(images, key=lambda image: -float(image.strength.sum()))
+    """Mirror images with the source that each belongs to, loudest first.
+
+    Parameters
+    ----------
+    images : sequence of (Evidence, Component)
+        Each with the scans that it was fitted to.
+    sources : sequence of Source
+    """
+    loudest_first = sorted(images, key=lambda pair: -float(pair[1].strength.sum()))
     return tuple(
         Reflection(
             float(image.place_m[0]),
@@ -26,7 +33,7 @@ def told_reflections(
             float(image.strength.sum()),
             _mirrored_source(evidence, image, sources),
         )
-        for image in loudest_first
+        for evidence, image in loudest_first
     )
 
 

@@ -45,7 +45,7 @@ class Share(IntEnum):
 ASSUMED = {Share.CLOSE_WALLS: 0.5, Share.ROOM: 0.5, Share.HIDDEN: 0.2}
 """Shares as long as the scans do not tell them. Walls reflect half; none passes a wall, but much a
 table whose edge or legs the lasers see."""
-SHARE_SIGMA = {Share.CLOSE_WALLS: 0.08, Share.ROOM: 0.02, Share.HIDDEN: 0.04}
+SHARE_SIGMA = {Share.CLOSE_WALLS: 0.08, Share.ROOM: 0.03, Share.HIDDEN: 0.04}
 """How firmly shares are held to what is assumed of them."""
 
 
