@@ -25,9 +25,11 @@ def segments(rings: tuple[np.ndarray, ...] = RINGS) -> np.ndarray:
     return np.concatenate([np.stack([ring, np.roll(ring, -1, axis=0)], axis=1) for ring in rings])
 
 
-def room(rings: tuple[np.ndarray, ...] = RINGS) -> OccupancyGrid:
+FRAME = GridFrame(CELL, (-1.5, -0.5), (120, 180))
+
+
+def room(rings: tuple[np.ndarray, ...] = RINGS, frame: GridFrame = FRAME) -> OccupancyGrid:
     """A room as a grid: cells that a wall runs through are occupied, those inside are free."""
-    frame = GridFrame(CELL, (-1.5, -0.5), (120, 180))
     occupied = np.zeros(frame.shape, dtype=bool)
     for start, end in segments(rings):
         steps = int(np.ceil(np.linalg.norm(end - start) / 0.01)) + 1

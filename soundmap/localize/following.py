@@ -16,7 +16,7 @@ from soundmap.geometry import FloatArray
 from soundmap.grid import OccupancyGrid
 from soundmap.localize.agreement import agreed_shares
 from soundmap.localize.global_start import FINE_SIGMA_M, nearness_to_wall, pose_score
-from soundmap.localize.map_fit import add_map_pull, surface_field
+from soundmap.localize.map_fit import add_map_pull, map_surface, pull_grids
 from soundmap.localize.views import Views
 
 KERNEL_M = 0.15
@@ -93,18 +93,11 @@ class Follower:
         weight: float,
         min_match: float,
     ) -> None:
-        self._views, field = views, surface_field(room)
+        self._views = views
         resolution = room.frame.resolution_m
         clearance = room.clearance_cells
         nearness = nearness_to_wall(clearance * np.float32(resolution), FINE_SIGMA_M)
-        self._map = (
-            field.distance_m,
-            field.origin_m,
-            clearance,
-            nearness,
-            np.array(room.frame.origin_m),
-            resolution,
-        )
+        self._map = (*pull_grids(map_surface(room)), clearance, nearness)
         axes = (NEARBY_M, NEARBY_M, NEARBY_RAD)
         self._window = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         self._trust = np.array([hit_sigma_m / np.sqrt(weight), 3.0 * hit_sigma_m, min_match])
@@ -145,11 +138,12 @@ class Follower:
 @njit(cache=True, nogil=True)
 def _follow(
     distance: NDArray[np.float32],
-    field_origin: FloatArray,
-    clearance: NDArray[np.float32],
-    nearness: NDArray[np.float32],
+    nearest: NDArray[np.int32],
+    normal: FloatArray,
     corner: FloatArray,
     resolution: float,
+    clearance: NDArray[np.float32],
+    nearness: NDArray[np.float32],
     window: FloatArray,
     trust: FloatArray,
     order: NDArray[np.int64],
@@ -175,7 +169,9 @@ def _follow(
                 odometry[k, 1] - odometry[order[n - 1], 1],
             )
         points, origins = end[first[k] : first[k + 1]], origin[first[k] : first[k + 1]]
-        found = _fitted(distance, field_origin, resolution, expected, spread, points, sigma)
+        found = _fitted(
+            distance, nearest, normal, corner, resolution, expected, spread, points, sigma
+        )
         flags = np.empty(len(points), dtype=np.bool_)
         shares = agreed_shares(
             clearance, corner, resolution, found, origins, points, tolerance, flags
@@ -183,7 +179,9 @@ def _follow(
         worse = shares[0] < usual - WORSE or shares[0] < min_match or (seek and n == 0)
         if worse and lost_m < LOOKED_FOR_M:
             near = _nearby(nearness, corner, resolution, window, expected, points)
-            near = _fitted(distance, field_origin, resolution, near, spread, points, sigma)
+            near = _fitted(
+                distance, nearest, normal, corner, resolution, near, spread, points, sigma
+            )
             other = agreed_shares(
                 clearance, corner, resolution, near, origins, points, tolerance, flags
             )
@@ -220,7 +218,9 @@ def _stepped(
 @njit(cache=True, nogil=True)
 def _fitted(
     distance: NDArray[np.float32],
-    field_origin: FloatArray,
+    nearest: NDArray[np.int32],
+    normal: FloatArray,
+    corner: FloatArray,
     resolution: float,
     expected: FloatArray,
     spread: FloatArray,
@@ -234,9 +234,19 @@ def _fitted(
     for _ in range(FIT_STEPS):
         information, pull = np.zeros((3, 3)), np.zeros(3)
         add_map_pull(
-            information, pull, distance, field_origin, resolution, pose, points, share, sigma,
+            information,
+            pull,
+            distance,
+            nearest,
+            normal,
+            corner,
+            resolution,
+            pose,
+            points,
+            share,
+            sigma,
             KERNEL_M,
-        )  # fmt: skip
+        )
         for m in range(3):
             off = pose[m] - expected[m]
             if m == 2:

@@ -17,38 +17,69 @@ from numpy.typing import NDArray
 from soundmap.geometry import FloatArray
 from soundmap.grid import OccupancyGrid
 
+WALL_REACH_M = 0.35
+"""Cells this near to a cell of a straight wall make a line with it ..."""
+WALL_FLATNESS = 0.08
+"""... whose variance across is at most this share of that along."""
+
 
 @dataclass(frozen=True)
-class SurfaceField:
-    """Distance to the nearest surface of the map.
+class Surface:
+    """The cells of a map that rays can hit, how far every cell is from them, and how they face.
 
     Attributes
     ----------
     distance_m : ndarray of float32, shape (H, W)
-        From the centre of each cell to that of the nearest cell that a ray can hit [m].
-    origin_m : ndarray, shape (2,)
-        Centre of cell [0, 0] in the map frame [m].
+        From the centre of each cell to that of the nearest surface cell [m].
+    nearest : ndarray of int32, shape (H, W)
+        Index of that surface cell.
+    own : ndarray of int32, shape (H, W)
+        Index of the cell itself where it is a surface cell, else -1.
+    cell : ndarray of int64, shape (C, 2)
+        Row and column of each surface cell.
+    centre_m : ndarray, shape (C, 2)
+        [m, map frame]
+    normal : ndarray, shape (C, 2)
+        Unit normal of the straight wall that a cell belongs to; zero where there is none. Either
+        sign.
+    corner_m : ndarray, shape (2,)
+        Lower-left corner of cell [0, 0] [m].
     resolution_m : float
     """
 
     distance_m: NDArray[np.float32]
-    origin_m: FloatArray
+    nearest: NDArray[np.int32]
+    own: NDArray[np.int32]
+    cell: NDArray[np.int64]
+    centre_m: FloatArray
+    normal: FloatArray
+    corner_m: FloatArray
     resolution_m: float
 
 
-def surface_field(room: OccupancyGrid) -> SurfaceField:
-    """Distances to the surfaces of a map; the inside of a thick wall is no surface."""
+def map_surface(room: OccupancyGrid) -> Surface:
+    """The surface cells of a map; the inside of a thick wall is no surface."""
     from scipy.ndimage import binary_erosion, distance_transform_edt
 
-    inside = binary_erosion(room.occupied, border_value=1)
-    surface = room.occupied & ~inside
-    distance = distance_transform_edt(~surface) * room.frame.resolution_m
-    centre = room.frame.centres([0, 0])
-    return SurfaceField(distance.astype(np.float32), centre, room.frame.resolution_m)
+    surface = room.occupied & ~binary_erosion(room.occupied, border_value=1)
+    own = np.full(room.frame.shape, -1, dtype=np.int32)
+    cell = np.argwhere(surface)
+    own[surface] = np.arange(len(cell), dtype=np.int32)
+    distance, (row, column) = distance_transform_edt(~surface, return_indices=True)
+    return Surface(
+        (distance * room.frame.resolution_m).astype(np.float32),
+        own[row, column],
+        own,
+        cell,
+        room.frame.centres(cell),
+        _wall_normals(own, cell, max(1, round(WALL_REACH_M / room.frame.resolution_m))),
+        np.array(room.frame.origin_m),
+        room.frame.resolution_m,
+    )
 
 
 def point_pull(
-    field: SurfaceField,
+    surface: Surface,
     pose: FloatArray,
     points_m: NDArray[np.floating],
     first: NDArray[np.int64],
@@ -60,11 +91,13 @@ def point_pull(
     r"""Normal equations of fitting the points of each pose to the map.
 
     The cost of pose k is :math:`\sum_i w_i d(T_k p_i)^2 / 2 \sigma^2` with Welsch's weights
-    :math:`w_i = e^{-d_i^2 / 2 c^2}`.
+    :math:`w_i = e^{-d_i^2 / 2 c^2}`. The cells of a wall at an angle make steps, which would hold a
+    pose along the wall; so, where the map shows a straight wall, :math:`d` counts as changing
+    across it alone.
 
     Parameters
     ----------
-    field : SurfaceField
+    surface : Surface
     pose : ndarray, shape (K, 3)
         Of the base in the map frame.
     points_m : ndarray, shape (P, 2)
@@ -86,9 +119,7 @@ def point_pull(
         :math:`-\sum w J^T d / \sigma^2`: the Gauss-Newton step solves information . step = pull.
     """
     return _point_pull(
-        field.distance_m,
-        field.origin_m,
-        field.resolution_m,
+        *pull_grids(surface),
         np.ascontiguousarray(pose),
         np.ascontiguousarray(points_m, dtype=np.float32),
         first,
@@ -98,10 +129,56 @@ def point_pull(
     )
 
 
+PullGrids = tuple[NDArray[np.float32], NDArray[np.int32], FloatArray, FloatArray, float]
+
+
+def pull_grids(surface: Surface) -> PullGrids:
+    """What `add_map_pull` needs of a surface."""
+    return (
+        surface.distance_m,
+        surface.nearest,
+        surface.normal,
+        surface.corner_m,
+        surface.resolution_m,
+    )
+
+
+@njit(cache=True, nogil=True)
+def _wall_normals(own: NDArray[np.int32], cell: NDArray[np.int64], reach: int) -> FloatArray:
+    """Normals of lines through the surface cells around each, zero where they make no line."""
+    rows, columns = own.shape
+    normal = np.zeros((len(cell), 2))
+    for c in range(len(cell)):
+        row, column = cell[c]
+        count = 0
+        x = y = xx = xy = yy = 0.0
+        for r in range(max(row - reach, 0), min(row + reach + 1, rows)):
+            for k in range(max(column - reach, 0), min(column + reach + 1, columns)):
+                dx, dy = k - column, r - row
+                if own[r, k] >= 0 and dx * dx + dy * dy <= reach * reach:
+                    count += 1
+                    x += dx
+                    y += dy
+                    xx += dx * dx
+                    xy += dx * dy
+                    yy += dy * dy
+        if count < reach:
+            continue
+        var_x, var_y = xx / count - (x / count) ** 2, yy / count - (y / count) ** 2
+        cov = xy / count - (x / count) * (y / count)
+        half_sum, half_gap = 0.5 * (var_x + var_y), np.hypot(0.5 * (var_x - var_y), cov)
+        if half_sum - half_gap <= WALL_FLATNESS * (half_sum + half_gap):
+            along = 0.5 * np.arctan2(2.0 * cov, var_x - var_y)
+            normal[c, 0], normal[c, 1] = -np.sin(along), np.cos(along)
+    return normal
+
+
 @njit(cache=True, nogil=True)
 def _point_pull(
     distance: NDArray[np.float32],
-    origin: FloatArray,
+    nearest: NDArray[np.int32],
+    normal: FloatArray,
+    corner: FloatArray,
     resolution: float,
     pose: FloatArray,
     points: NDArray[np.float32],
@@ -118,7 +195,9 @@ def _point_pull(
             information[k],
             pull[k],
             distance,
-            origin,
+            nearest,
+            normal,
+            corner,
             resolution,
             pose[k],
             points[own],
@@ -134,7 +213,9 @@ def add_map_pull(
     information: FloatArray,
     pull: FloatArray,
     distance: NDArray[np.float32],
-    origin: FloatArray,
+    nearest: NDArray[np.int32],
+    normal: FloatArray,
+    corner: FloatArray,
     resolution: float,
     pose: FloatArray,
     points: NDArray[np.float32],
@@ -148,8 +229,8 @@ def add_map_pull(
     for i in range(len(points)):
         lever_x = cos * points[i, 0] - sin * points[i, 1]
         lever_y = sin * points[i, 0] + cos * points[i, 1]
-        u = (pose[0] + lever_x - origin[0]) / resolution
-        v = (pose[1] + lever_y - origin[1]) / resolution
+        u = (pose[0] + lever_x - corner[0]) / resolution - 0.5  # from the centre of cell [0, 0]
+        v = (pose[1] + lever_y - corner[1]) / resolution - 0.5
         if not (0.0 <= u < columns - 1 and 0.0 <= v < rows - 1):
             continue
         column, row = int(u), int(v)
@@ -161,6 +242,10 @@ def add_map_pull(
             continue
         slope_x = ((1 - b) * (d01 - d00) + b * (d11 - d10)) / resolution
         slope_y = ((1 - a) * (d10 - d00) + a * (d11 - d01)) / resolution
+        wall = nearest[int(v + 0.5), int(u + 0.5)]
+        across = slope_x * normal[wall, 0] + slope_y * normal[wall, 1]
+        if normal[wall, 0] != 0.0 or normal[wall, 1] != 0.0:
+            slope_x, slope_y = across * normal[wall, 0], across * normal[wall, 1]
         weight = share[i] * np.exp(-0.5 * (off / kernel) ** 2) / (sigma * sigma)
         add_residual(information, pull, off, slope_x, slope_y, lever_x, lever_y, weight)
 

@@ -26,7 +26,9 @@ FIRST_MATCH = 0.6
 MOST_BEYOND = 0.10
 """Share of it that may lie behind the map's walls then."""
 ELSEWHERE_MATCH = 0.8
-"""Share that must match to believe that the robot is where odometry cannot have led."""
+"""Share that must match to believe that the robot is where odometry cannot have led ..."""
+ELSEWHERE_WAY_M = 3.0
+"""... over at least this way: a few views may fit anywhere by chance."""
 ODOMETRY_DRIFT = 0.2
 """Worst drift of any odometry in use [m/m and rad/m]."""
 SEARCH_EVERY_M = 3.0
@@ -130,11 +132,13 @@ class Placement:
             raise MapError("the map has no free space in which the robot could stand.")
         ahead, back = stretch[stretch >= view], stretch[stretch <= view][::-1]
         orders = sorted([ahead, back], key=len, reverse=True)
+        driven_m = views.driven_m[stretch]
+        is_long = driven_m[-1] - driven_m[0] >= ELSEWHERE_WAY_M
         proved = []
         for each in surviving(self._follower, orders, hypotheses):
             expected = any(leads_to(views, edge, edges[edge], view, each.start) for edge in edges)
             needed = FIRST_MATCH if expected or not edges else ELSEWHERE_MATCH
-            if self._is_proved(each, needed):
+            if (expected or not edges or is_long) and self._is_proved(each, needed):
                 proved.append((each, expected))
         likely = [each for each, expected in proved if expected] or [each for each, _ in proved]
         if len(likely) > 1 and not edges:

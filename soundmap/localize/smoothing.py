@@ -20,6 +20,9 @@ from soundmap.geometry import FloatArray, composed, relative, wrapped_angle
 STEPS = 6
 """Most Gauss-Newton steps; poses a decimetre off take three or four."""
 SETTLED_M = 0.0005
+SYSTEMATIC = (0.03, 0.03, 0.01)
+"""Standard deviations of what stays unknown of the odometry's scale [m/m], scale of turns [rad/rad]
+and turn per way [rad/m] after both have been learnt from the run."""
 SLIP_CHI2 = 3.0
 """A step this surprising, as a squared Mahalanobis distance, has half its weight."""
 
@@ -40,6 +43,9 @@ def smoothed_poses(
 ) -> SmoothedPoses:
     """Most likely poses given all odometry and laser scans.
 
+    The covariance includes what `SYSTEMATIC` errors of the odometry would do: along a featureless
+    corridor they add up, where independent errors of the steps would cancel.
+
     Parameters
     ----------
     step : ndarray, shape (K - 1, 3)
@@ -53,19 +59,61 @@ def smoothed_poses(
     guess = pose.copy()
     for _ in range(STEPS):
         information, pull = scans(guess)
-        diagonal, coupling, right = _normal_equations(guess, step, weight, information)
-        change = _solved(diagonal, coupling, right + pull)
+        chain = _linearised(guess, step, weight)
+        diagonal = chain.diagonal + information
+        change = _solved(diagonal, chain.coupling, chain.pull(chain.error) + pull)
         guess = guess + change
         guess[:, 2] = wrapped_angle(guess[:, 2])
         if np.abs(change[:, :2]).max() < SETTLED_M:
             break
-    return SmoothedPoses(guess, _marginal_covariance(diagonal, coupling))
+    covariance = _marginal_covariance(diagonal, chain.coupling)
+    for error in _systematic_errors(step):
+        shift = _solved(diagonal, chain.coupling, chain.pull(error))
+        covariance += shift[:, :, None] * shift[:, None, :]
+    return SmoothedPoses(guess, covariance)
 
 
-def _normal_equations(
-    pose: FloatArray, step: FloatArray, weight: FloatArray, information: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Diagonal blocks (K, 3, 3), blocks beside it (K - 1, 3, 3) and right-hand side (K, 3)."""
+def _systematic_errors(step: FloatArray) -> list[FloatArray]:
+    """What each of the `SYSTEMATIC` errors adds to the steps, shapes (K - 1, 3)."""
+    scale, turn_scale, turn_per_metre = SYSTEMATIC
+    way_m = np.hypot(step[:, 0], step[:, 1])
+    return [
+        scale * step * [1.0, 1.0, 0.0],
+        turn_scale * step * [0.0, 0.0, 1.0],
+        turn_per_metre * way_m[:, None] * [0.0, 0.0, 1.0],
+    ]
+
+
+@dataclass(frozen=True)
+class _Chain:
+    """The odometry's part of the normal equations.
+
+    Attributes
+    ----------
+    error : ndarray, shape (K - 1, 3)
+        Steps between the poses less those of the odometry.
+    diagonal : ndarray, shape (K, 3, 3)
+    coupling : ndarray, shape (K - 1, 3, 3)
+        The blocks beside the diagonal.
+    before, after : ndarray, shapes (K - 1, 3, 3)
+        Transposed Jacobians by the pose at either end of a step, times its information.
+    """
+
+    error: FloatArray
+    diagonal: FloatArray
+    coupling: FloatArray
+    before: FloatArray
+    after: FloatArray
+
+    def pull(self, error: FloatArray) -> FloatArray:
+        """The right-hand side that errors of the steps, shape (K - 1, 3), make, shape (K, 3)."""
+        right = np.zeros((len(self.diagonal), 3))
+        right[:-1] -= np.einsum("kij,kj->ki", self.before, error)
+        right[1:] -= np.einsum("kij,kj->ki", self.after, error)
+        return right
+
+
+def _linearised(pose: FloatArray, step: FloatArray, weight: FloatArray) -> _Chain:
     before, after = pose[:-1], pose[1:]
     error = relative(before, after) - step
     error[:, 2] = wrapped_angle(error[:, 2])
@@ -83,13 +131,10 @@ def _normal_equations(
     by_before[:, 1, 2] = -cos * dx - sin * dy
     left_before = by_before.swapaxes(1, 2) @ weight
     left_after = by_after.swapaxes(1, 2) @ weight
-    diagonal = information + 1e-9 * np.eye(3)
+    diagonal = np.tile(1e-9 * np.eye(3), (len(pose), 1, 1))
     diagonal[:-1] += left_before @ by_before
     diagonal[1:] += left_after @ by_after
-    right = np.zeros_like(pose)
-    right[:-1] -= np.einsum("kij,kj->ki", left_before, error)
-    right[1:] -= np.einsum("kij,kj->ki", left_after, error)
-    return diagonal, left_before @ by_after, right
+    return _Chain(error, diagonal, left_before @ by_after, left_before, left_after)
 
 
 def _solved(diagonal: FloatArray, coupling: FloatArray, right: FloatArray) -> FloatArray:
@@ -135,7 +180,7 @@ def carried(pose: FloatArray, step: FloatArray, trusted: NDArray[np.bool_]) -> F
     known = np.flatnonzero(trusted)
     if len(known) == 0:
         return pose
-    odometry = _chained(step)
+    odometry = chained(step)
     index = np.arange(len(pose))
     right = np.searchsorted(known, index).clip(0, len(known) - 1)
     left = (np.searchsorted(known, index, side="right") - 1).clip(0, len(known) - 1)
@@ -144,7 +189,7 @@ def carried(pose: FloatArray, step: FloatArray, trusted: NDArray[np.bool_]) -> F
     return composed(pose[anchor], relative(odometry[anchor], odometry))
 
 
-def _chained(step: FloatArray) -> FloatArray:
+def chained(step: FloatArray) -> FloatArray:
     """Poses to which steps lead from the origin, shape (K, 3) from (K - 1, 3)."""
     heading = np.concatenate([[0.0], np.cumsum(step[:, 2])])
     cos, sin = np.cos(heading[:-1]), np.sin(heading[:-1])

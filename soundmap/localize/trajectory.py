@@ -11,11 +11,18 @@ from numpy.typing import NDArray
 from soundmap.carrying import carried_poses, odometry_times_between
 from soundmap.config import LocalizeConfig
 from soundmap.errors import MapError
-from soundmap.geometry import FloatArray, Trajectory, relative
+from soundmap.geometry import FloatArray, Trajectory, relative, wrapped_angle
 from soundmap.grid import OccupancyGrid
 from soundmap.localize.agreement import Agreement, agreement
-from soundmap.localize.placement import CANNOT_TELL, FIRST_MATCH, MOST_BEYOND, Placement
-from soundmap.localize.smoothing import SmoothedPoses, carried, smoothed_poses
+from soundmap.localize.placement import (
+    CANNOT_TELL,
+    ELSEWHERE_WAY_M,
+    FIRST_MATCH,
+    MOST_BEYOND,
+    ODOMETRY_DRIFT,
+    Placement,
+)
+from soundmap.localize.smoothing import SmoothedPoses, carried, chained, smoothed_poses
 from soundmap.localize.tracking import Tracker
 from soundmap.localize.views import STAGE, Views, chosen_views
 from soundmap.localize.wall_fit import WallFit
@@ -29,6 +36,8 @@ UNKNOWN_ODOMETRY = OdometryModel(
 """What is believed of the odometry before the run has shown how good it is: not much."""
 RARE_NS = 600_000_000
 """Between laser scans farther apart than this, odometry carries the pose."""
+TORN_M, TORN_RAD = 0.5, np.radians(30.0)
+"""A step that differs so much from that of the odometry tears the trajectory."""
 ROUNDS = 4
 """Times that all poses are smoothed and it is judged anew which of them to trust."""
 
@@ -144,7 +153,7 @@ def _smoothed(
         result = smoothed_poses(step, weight, pose, scans)
         pose = result.pose
         agreed = agreement(room, pose, views, tolerance_m=tolerance_m)
-        trusted = _trusted(agreed, result, trusted, config)
+        trusted = _without_scraps(_trusted(agreed, result, trusted, config), pose, step)
         if round_ == 0:  # later poses follow the odometry and cannot judge it
             both = trusted[:-1] & trusted[1:]
             found = relative(pose[:-1], pose[1:])
@@ -173,6 +182,38 @@ def _trusted(
     near = np.sqrt(variance[:, 0] + variance[:, 1]) <= config.max_spread_m
     near &= np.sqrt(variance[:, 2]) <= config.max_spread_rad
     return near & np.where(before, agreed.matched >= config.min_match, proved)
+
+
+def _without_scraps(
+    trusted: NDArray[np.bool_], pose: FloatArray, step: FloatArray
+) -> NDArray[np.bool_]:
+    """The trusted poses less short pieces that odometry joins to neither neighbour.
+
+    A few views may fit some other place of the map by chance.
+
+    Parameters
+    ----------
+    trusted : ndarray of bool, shape (K,)
+    pose : ndarray, shape (K, 3)
+    step : ndarray, shape (K - 1, 3)
+        Motion from each pose to the next according to the odometry.
+    """
+    index = np.flatnonzero(trusted)
+    if len(index) < 2:
+        return trusted
+    way_m = np.concatenate([[0.0], np.cumsum(np.hypot(step[:, 0], step[:, 1]))])[index]
+    by_odometry = chained(step)[index]
+    found = relative(pose[index[:-1]], pose[index[1:]])
+    off = found - relative(by_odometry[:-1], by_odometry[1:])
+    drift = ODOMETRY_DRIFT * np.diff(way_m)
+    torn = np.hypot(off[:, 0], off[:, 1]) > TORN_M + drift
+    torn |= np.abs(wrapped_angle(off[:, 2])) > TORN_RAD + drift
+    piece = np.concatenate([[0], np.cumsum(torn)])
+    length_m = np.array([np.ptp(way_m[piece == number]) for number in range(piece[-1] + 1)])
+    scraps = length_m < min(ELSEWHERE_WAY_M, length_m.max())
+    kept = trusted.copy()
+    kept[index[scraps[piece]]] = False
+    return kept
 
 
 def _checked(

@@ -16,41 +16,13 @@ from numba import njit
 from numpy.typing import NDArray
 
 from soundmap.geometry import FloatArray
-from soundmap.grid import OccupancyGrid
-from soundmap.localize.map_fit import add_residual
+from soundmap.localize.map_fit import Surface, add_residual
 
 REACH_M = 0.15
 """Returns farther than this from a surface cell do not belong to it."""
 LEAST_POINTS = 6
 FLATNESS = 0.2
 """Greatest ratio of the variances across and along a line that still is one."""
-
-
-@dataclass(frozen=True)
-class SurfaceCells:
-    """The cells of the map that rays can hit, and which of them is nearest to any cell.
-
-    Attributes
-    ----------
-    nearest : ndarray of int32, shape (H, W)
-        Index of the nearest surface cell.
-    own : ndarray of int32, shape (H, W)
-        Index of the cell itself where it is a surface cell, else -1.
-    cell : ndarray of int64, shape (C, 2)
-        Row and column of each surface cell.
-    centre_m : ndarray, shape (C, 2)
-        [m, map frame]
-    corner_m : ndarray, shape (2,)
-        Lower-left corner of cell [0, 0] [m].
-    resolution_m : float
-    """
-
-    nearest: NDArray[np.int32]
-    own: NDArray[np.int32]
-    cell: NDArray[np.int64]
-    centre_m: FloatArray
-    corner_m: FloatArray
-    resolution_m: float
 
 
 @dataclass(frozen=True)
@@ -69,31 +41,12 @@ class WallLines:
     offset_m: FloatArray
 
 
-def surface_cells(room: OccupancyGrid) -> SurfaceCells:
-    """The surface cells of a map; the inside of a thick wall is no surface."""
-    from scipy.ndimage import binary_erosion, distance_transform_edt
-
-    surface = room.occupied & ~binary_erosion(room.occupied, border_value=1)
-    own = np.full(room.frame.shape, -1, dtype=np.int32)
-    cell = np.argwhere(surface)
-    own[surface] = np.arange(len(cell), dtype=np.int32)
-    row, column = distance_transform_edt(~surface, return_distances=False, return_indices=True)
-    return SurfaceCells(
-        own[row, column],
-        own,
-        cell,
-        room.frame.centres(cell),
-        np.array(room.frame.origin_m),
-        room.frame.resolution_m,
-    )
-
-
-def wall_lines(surface: SurfaceCells, points_m: FloatArray) -> WallLines:
+def wall_lines(surface: Surface, points_m: FloatArray) -> WallLines:
     """Lines through the returns about each surface cell and its neighbours.
 
     Parameters
     ----------
-    surface : SurfaceCells
+    surface : Surface
     points_m : ndarray, shape (P, 2)
         Laser returns of the whole run in the map frame [m].
     """
@@ -119,7 +72,7 @@ def wall_lines(surface: SurfaceCells, points_m: FloatArray) -> WallLines:
     return WallLines(normal, np.sum(normal * (mean + surface.corner_m), axis=1))
 
 
-def has_line(surface: SurfaceCells, lines: WallLines, points_m: FloatArray) -> NDArray[np.bool_]:
+def has_line(surface: Surface, lines: WallLines, points_m: FloatArray) -> NDArray[np.bool_]:
     """Whether the surface cell nearest to each point has a line, shape (P,); map frame [m]."""
     cell = np.floor((points_m - surface.corner_m) / surface.resolution_m).astype(np.int64)[:, ::-1]
     inside = np.all((cell >= 0) & (cell < surface.nearest.shape), axis=1)
@@ -128,7 +81,7 @@ def has_line(surface: SurfaceCells, lines: WallLines, points_m: FloatArray) -> N
 
 
 def line_pull(
-    surface: SurfaceCells,
+    surface: Surface,
     lines: WallLines,
     pose: FloatArray,
     points_m: NDArray[np.floating],

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from soundmap.geometry import composed, relative, wrapped_angle
+from soundmap.localize import smoothing
 from soundmap.localize.smoothing import carried, smoothed_poses
 
 
@@ -60,8 +61,21 @@ def test_an_interval_without_scans_is_bridged_from_both_sides():
     assert np.argmax(spread) in range(30, 50)
 
 
-def test_covariances_are_the_blocks_of_the_inverse_of_the_whole_system():
+def test_systematic_errors_of_the_odometry_add_up_where_no_scan_holds_the_pose():
+    truth, step = drive(200)
+    information = np.zeros((200, 3, 3))
+    information[0] = np.diag([1e6, 1e6, 1e8])
+    found = smoothed_poses(step, weights(199), truth, fixes_at(truth, information))
+    way_m = np.hypot(step[:, 0], step[:, 1]).sum()
+    away_m = np.hypot(*(truth[-1] - truth[0])[:2])
+    sigma_m = np.sqrt(np.trace(found.covariance[-1, :2, :2]))
+    assert sigma_m > smoothing.SYSTEMATIC[0] * away_m
+    assert sigma_m < 0.2 * way_m
+
+
+def test_covariances_are_the_blocks_of_the_inverse_of_the_whole_system(monkeypatch):
     """Central differences of the cost give the full matrix, inverted without any band."""
+    monkeypatch.setattr(smoothing, "SYSTEMATIC", (0.0, 0.0, 0.0))
     truth, step = drive(6)
     information = np.repeat(np.diag([300.0, 200.0, 900.0])[None], 6, axis=0)
     evidence = fixes_at(truth, information)

@@ -228,6 +228,33 @@ def test_odometry_that_sticks_in_mid_run_does_not_lose_the_robot():
         assert position[estimate.usable].max() < 0.15
 
 
+@pytest.mark.parametrize("seen_end", [True, False])
+def test_in_a_featureless_corridor_no_pose_is_usable_that_is_not_known(seen_end):
+    """Scanners that reach 4 m in a slanted corridor of 24 m; odometry reports 4 % too much."""
+    turn = 0.3
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    ring = np.array([[0, 0], [24, 0], [24, 2], [0, 2]]) @ rotation.T
+    way = np.array([[1.0, 1.0], [23.0 if seen_end else 16.0, 1.0]]) @ rotation.T
+    truth = worlds.driven([tuple(point) for point in way])
+    scans = [
+        replace(scan, range_m=np.where(scan.range_m < 4.0, scan.range_m, np.nan))
+        for scan in worlds.laser_scans(
+            truth, [worlds.FRONT, worlds.BACK], rate_hz=10.0, beams=181, rings=(ring,)
+        )
+    ]
+    frame = GridFrame(0.05, (-1.5, -0.5), (220, 520))
+    room, odometry = worlds.room((ring,), frame), odometry_of(truth, scale=1.04)
+    start = tuple(truth.pose[0])
+    estimate = estimate_trajectory(scans, odometry, room, CONFIG, start_pose=start)
+    off, _ = errors(estimate, truth)
+    sigma = np.sqrt(np.trace(estimate.covariance[:, :2, :2], axis1=1, axis2=2))
+    assert off[estimate.usable].max() < 0.3
+    assert np.mean(off > 3.0 * sigma + 0.02) < 0.05
+    if not seen_end:
+        assert not estimate.usable[-1]
+        assert sigma[-1] > 0.3
+
+
 class TestPlacesThatLookAlike:
     """A rectangular room without a mark is the same after half a turn."""
 

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import worlds
@@ -5,8 +7,9 @@ import worlds
 from soundmap.deskew import deskewed_rays
 from soundmap.geometry import transformed
 from soundmap.grid import GridFrame, OccupancyGrid
-from soundmap.localize.map_fit import point_pull, surface_field
-from soundmap.localize.wall_lines import has_line, line_pull, surface_cells, wall_lines
+from soundmap.localize.map_fit import map_surface, point_pull
+from soundmap.localize.wall_fit import without_hearsay
+from soundmap.localize.wall_lines import has_line, line_pull, wall_lines
 
 ROOM = worlds.room()
 TRUTH = worlds.driven([(1.0, 1.0), (4.0, 1.2), (1.2, 1.8)])
@@ -27,7 +30,7 @@ def settled(pose, pull):
 
 def by_map(pose):
     share = np.ones(len(FLAT))
-    return point_pull(surface_field(ROOM), pose, FLAT, FIRST, share, sigma_m=0.05, kernel_m=0.2)
+    return point_pull(map_surface(ROOM), pose, FLAT, FIRST, share, sigma_m=0.05, kernel_m=0.2)
 
 
 def test_points_are_pulled_onto_the_walls_of_the_map():
@@ -41,13 +44,15 @@ def test_points_are_pulled_onto_the_walls_of_the_map():
 def test_the_pull_is_the_gradient_of_the_cost():
     pose = POSES[:1] + np.array([0.02, -0.03, 0.01])
     points, first = POINTS[0], np.array([0, len(POINTS[0])], dtype=np.int64)
-    field, share = surface_field(ROOM), np.ones(len(POINTS[0]))
+    field, share = map_surface(ROOM), np.ones(len(POINTS[0]))
+    field = replace(field, normal=np.zeros_like(field.normal))  # as if no wall were straight
+    first_centre = field.corner_m + 0.5 * field.resolution_m
 
     def pull(at, kernel):
         return point_pull(field, at, points, first, share, sigma_m=0.05, kernel_m=kernel)[1][0]
 
     def cost(at):  # of a kernel so wide that every weight is 1
-        place = (transformed(at[0], points) - field.origin_m) / field.resolution_m
+        place = (transformed(at[0], points) - first_centre) / field.resolution_m
         column, row = np.floor(place).astype(int).T
         a, b = (place - np.floor(place)).T
         d = field.distance_m
@@ -63,12 +68,29 @@ def test_the_pull_is_the_gradient_of_the_cost():
     assert pull(pose, 1e3) == pytest.approx(numeric, rel=1e-3)
 
 
+@pytest.mark.parametrize("angle_deg", [0.0, 7.0, 30.0, 45.0])
+def test_a_straight_wall_says_nothing_about_the_place_along_it(angle_deg):
+    """However the cells of a wall at an angle make steps."""
+    frame = GridFrame(0.05, (0.0, 0.0), (200, 200))
+    along = np.array([np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))])
+    wall = np.array([5.0, 5.0]) + np.linspace(-4.0, 4.0, 4000)[:, None] * along
+    occupied = np.zeros(frame.shape, dtype=bool)
+    occupied[tuple(frame.cells(wall).T)] = True
+    pose, points = np.array([[5.0, 5.0, 0.0]]), np.linspace(-2.0, 2.0, 200)[:, None] * along
+    surface = map_surface(OccupancyGrid(frame, occupied, ~occupied))
+    information, _ = point_pull(
+        surface, pose, points, np.array([0, 200]), np.ones(200), sigma_m=0.05, kernel_m=0.15
+    )
+    values = np.linalg.eigvalsh(information[0, :2, :2])
+    assert values[0] < 0.01 * values[1]
+
+
 def test_lines_stand_where_the_returns_are_and_not_where_the_cells_are():
     """A wall 2 cm off the middle of its cells is found there."""
     frame = GridFrame(0.05, (0.0, 0.0), (40, 60))
     occupied = np.zeros(frame.shape, dtype=bool)
     occupied[20] = True  # centre at y = 1.025
-    surface = surface_cells(OccupancyGrid(frame, occupied, ~occupied))
+    surface = map_surface(OccupancyGrid(frame, occupied, ~occupied))
     rng = np.random.default_rng(1)
     x = rng.uniform(0.2, 2.8, 2000)
     points = np.column_stack([x, 1.005 + 0.01 * x + rng.normal(0, 0.01, 2000)])
@@ -83,7 +105,7 @@ def test_lines_stand_where_the_returns_are_and_not_where_the_cells_are():
 
 
 def test_poses_fitted_to_lines_agree_to_millimetres():
-    surface = surface_cells(ROOM)
+    surface = map_surface(ROOM)
     lines = wall_lines(surface, transformed(np.repeat(POSES, np.diff(FIRST), axis=0), FLAT))
 
     def by_lines(pose):
@@ -96,7 +118,7 @@ def test_poses_fitted_to_lines_agree_to_millimetres():
 
 
 def test_scattered_returns_and_few_returns_are_no_line():
-    surface = surface_cells(ROOM)
+    surface = map_surface(ROOM)
     rng = np.random.default_rng(3)
     cloud = surface.centre_m[100] + rng.normal(0, 0.05, (500, 2))
     assert has_line(surface, wall_lines(surface, cloud), cloud).mean() < 0.05
@@ -108,7 +130,22 @@ def test_points_far_from_every_wall_do_not_pull():
     far = np.array([[0.0, 1.0], [0.5, 1.0]])  # in the middle of the room, seen from (1, 1)
     pose = np.array([[1.0, 1.0, 0.0]])
     information, pull = point_pull(
-        surface_field(ROOM), pose, far, np.array([0, 2]), np.ones(2), sigma_m=0.05, kernel_m=0.15
+        map_surface(ROOM), pose, far, np.array([0, 2]), np.ones(2), sigma_m=0.05, kernel_m=0.15
     )
     assert not information.any()
     assert not pull.any()
+
+
+def test_what_walls_of_one_direction_seem_to_say_along_them_is_taken_off():
+    normal = np.array([np.sin(0.4), np.cos(0.4), 0.0])
+    along = np.array([np.cos(0.4), -np.sin(0.4), 0.0])
+    turn = np.diag([0.0, 0.0, 5000.0])
+    corridor = 3000.0 * np.outer(normal, normal) + 3.0 * np.outer(along, along) + turn
+    corner = 3000.0 * np.outer(normal, normal) + 900.0 * np.outer(along, along) + turn
+    pull = np.stack([30.0 * normal + 2.0 * along] * 2)
+    information, pulled = without_hearsay(np.stack([corridor, corner]), pull)
+    assert along @ information[0] @ along == pytest.approx(0.0, abs=1e-6)
+    assert along @ pulled[0] == pytest.approx(0.0, abs=1e-6)
+    assert normal @ information[0] @ normal == pytest.approx(3000.0)
+    assert along @ information[1] @ along == pytest.approx(891.0)
+    assert normal @ pulled[1] == pytest.approx(30.0)
