@@ -30,13 +30,13 @@ LEAST_EXPLAINED = 0.7
 """Stretches on which less of what was heard comes from fixed places tell nothing."""
 EQUAL_SHARE = 0.02
 """Fits that explain this much less than the best still count as equal to it."""
-SYSTEMATIC = np.array([0.0015, np.radians(0.2)])
+SYSTEMATIC = np.array([0.003, np.radians(0.2)])
 """What the variance of the fit does not know of, as seen on simulated sites [s, rad]."""
 YAW_ALONE = np.array([0.0, 1.0])
 """The yaw rests on where the places are, and one that is wrong may pull it; the clock on turns."""
 USEFUL = np.array([0.015, np.radians(1.5)])
 """Results less certain than this, as a standard deviation, are of no use [s, rad]."""
-CLEAR_SIGMAS = 3.0
+CLEAR_SIGMAS = 3.5
 
 
 def array_offsets(
