@@ -155,6 +155,14 @@ def process(
             "the same.",
         ),
     ] = False,
+    no_cache: Annotated[
+        bool,
+        typer.Option(
+            "--no-cache",
+            help="Read, map, localize and beamform again even if an earlier run has done so with "
+            "the same settings, and keep nothing for later ones.",
+        ),
+    ] = False,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -174,7 +182,17 @@ def process(
     folders = _run_folders(logs, out)
     settings = resolved_config(config)
     work = [
-        Job(log, folder, map_file, settings, start, figures, rerun=rerun, force=force)
+        Job(
+            log,
+            folder,
+            map_file,
+            settings,
+            start,
+            figures,
+            rerun=rerun,
+            force=force,
+            use_cache=not no_cache,
+        )
         for log, folder in zip(logs, folders, strict=True)
     ]
     outcomes: list[dict[str, Any]] = [{} for _ in work]

@@ -49,8 +49,9 @@ class Job:
     start_pose : tuple of float or None
         x [m], y [m], heading [rad].
     figures : PictureFormat
-    rerun, force : bool
-        Whether to write a recording, and whether to replace an earlier run.
+    rerun, force, use_cache : bool
+        Whether to write a recording, whether to replace an earlier run, and whether to take what
+        earlier runs have kept and to keep what this one measures.
     """
 
     log: Path
@@ -61,6 +62,7 @@ class Job:
     figures: PictureFormat
     rerun: bool
     force: bool
+    use_cache: bool = True
 
 
 Outcome = dict[str, Any] | SoundmapError
@@ -79,10 +81,16 @@ def processed(job: Job, progress: Progress) -> dict[str, Any]:
     from soundmap.outputs.run_folder import write_run
 
     with new_folder(job.folder, force=job.force, inputs=[job.log]) as new:
+        from soundmap.measured import MeasuredCache, cache_folder
         from soundmap.replay import process
 
         run = process(
-            job.log, job.map_file, job.config, start_pose=job.start_pose, progress=progress
+            job.log,
+            job.map_file,
+            job.config,
+            start_pose=job.start_pose,
+            cache=MeasuredCache(cache_folder()) if job.use_cache else None,
+            progress=progress,
         )
         if job.rerun:
             from soundmap.retelling import recorded

@@ -21,11 +21,16 @@ from soundmap.fuse.bearing_range import ranges_around
 from soundmap.fuse.power_map import fused_scans, level_reference, power_map_frame
 from soundmap.fuse.surroundings import SurroundingsGatherer
 from soundmap.geometry import Trajectory
+from soundmap.grid import OccupancyGrid
 from soundmap.localize.trajectory import localized
 from soundmap.localize.views import ViewChooser
+from soundmap.logs.log_files import log_files
+from soundmap.logs.reader import McapLog
 from soundmap.logs.robot_log import RobotLog, open_log
+from soundmap.losses import LossLedger
 from soundmap.map_file import read_map
 from soundmap.mapping.geometric_map import BuiltMap, build_map
+from soundmap.measured import Measured, MeasuredCache, measured_key
 from soundmap.outputs.progress import Progress, Stage
 from soundmap.run import Run
 from soundmap.scan.audio_scan import audio_scans, kept_scans
@@ -43,6 +48,7 @@ def process(
     config: Config,
     *,
     start_pose: tuple[float, float, float] | None = None,
+    cache: MeasuredCache | None = None,
     progress: Progress,
 ) -> Run:
     """Sources, power map and trajectory of one log.
@@ -57,6 +63,8 @@ def process(
     config : Config
     start_pose : tuple of float, optional
         x [m], y [m], heading [rad] in the given map; without it, it is found in the map.
+    cache : MeasuredCache, optional
+        Where the results of the slow stages are kept, and taken from if they are there.
     progress : Progress
 
     Raises
@@ -66,14 +74,98 @@ def process(
     """
     given = None if map_path is None else read_map(map_path)
     clock = _Stopwatch(progress)
+    measured, from_cache = _kept_or_measured(log_path, given, config, start_pose, cache, clock)
+    room, trajectory, surroundings = measured.room, measured.trajectory, measured.surroundings
+    losses = LossLedger()
+    with clock.stage("calibrate"):
+        scans, array, offsets = _calibrated(measured.scans, measured.array, trajectory, config)
+    with clock.stage("fuse"):
+        frame = power_map_frame(room, config.fuse.cell_m)
+        accumulator = PowerAccumulator(frame, level_reference(array.pascal_per_count))
+        fused = sum(
+            scan.point_m is not None
+            for scan in fused_scans(
+                scans,
+                surroundings,
+                trajectory,
+                accumulator,
+                array.mount,
+                config.fuse,
+                losses=losses,
+            )
+        )
+        power_map = accumulator.power_map()
+    with clock.stage("detect"):
+        if config.detect.method == "sparse":
+            around = ranges_around(surroundings, trajectory, scans.time_ns, array.mount)
+            sources = fitted_sources(
+                scans, around, trajectory, array, config.scan, config.detect, room=room
+            )
+            sources = with_level_errors(sources, scans, trajectory, array, room, config.scan)
+        else:
+            sources = detect_sources(power_map, config.detect)
+    return Run(
+        log=log_path,
+        fingerprint=measured.fingerprint,
+        config=config,
+        room=room,
+        trajectory=trajectory,
+        scans=scans,
+        power_map=power_map,
+        sources=sources,
+        losses=(*measured.losses, *losses),
+        counts={
+            "laser scanners": measured.scanners,
+            "odometry poses": measured.odometry_poses,
+            "laser scans used": len(trajectory.of_scans()),
+            "audio scans": len(scans),
+            "audio scans fused": fused,
+        },
+        timings_s=clock.timings_s,
+        duration_s=measured.duration_s,
+        offsets=offsets,
+        from_cache=from_cache,
+    )
+
+
+def _kept_or_measured(
+    log_path: Path,
+    given: OccupancyGrid | None,
+    config: Config,
+    start_pose: tuple[float, float, float] | None,
+    cache: MeasuredCache | None,
+    clock: _Stopwatch,
+) -> tuple[Measured, bool]:
+    """What the slow stages yield, and whether it comes from an earlier run."""
+    if cache is None:
+        return _measured(log_path, given, config, start_pose, clock), False
+    with clock.stage("earlier run"):
+        files = log_files(log_path)
+        fingerprint = McapLog(log_path, files, LossLedger()).fingerprint()
+        key = measured_key(files, fingerprint, config, given, start_pose)
+        kept = cache.get(key)
+    if kept is not None:
+        return kept, True
+    measured = _measured(log_path, given, config, start_pose, clock)
+    if measured.fingerprint == fingerprint:  # else the log has changed in the meantime
+        cache.put(key, measured)
+    return measured, False
+
+
+def _measured(
+    log_path: Path,
+    given: OccupancyGrid | None,
+    config: Config,
+    start_pose: tuple[float, float, float] | None,
+    clock: _Stopwatch,
+) -> Measured:
+    """One pass over the log: audio scans and surroundings; and the trajectory in the map."""
     with clock.stage("read"):
         log = open_log(log_path, config)
     array = log.array
     if array is None:
         raise ValueError("the log was opened without audio")
     _check_band(log, config.scan)
-    reference = level_reference(array.pascal_per_count)
-
     built = _built_map(log, config, clock) if given is None else None
     gatherer = SurroundingsGatherer(log.odometry)
     chooser = ViewChooser(log.odometry, config.localize, log.losses)
@@ -89,7 +181,7 @@ def process(
                 threads=min(numba.get_num_threads(), MOST_THREADS),
                 sharp=config.calibrate.mode != "off",
             ),
-            reference,
+            level_reference(array.pascal_per_count),
             array.mount,
             config.scan.sub_band_hz,
         )
@@ -112,46 +204,17 @@ def process(
                 start_pose=start_pose,
                 losses=log.losses,
             )
-    with clock.stage("calibrate"):
-        scans, array, offsets = _calibrated(scans, array, trajectory, config)
-    with clock.stage("fuse"):
-        accumulator = PowerAccumulator(power_map_frame(room, config.fuse.cell_m), reference)
-        fused = sum(
-            scan.point_m is not None
-            for scan in fused_scans(
-                scans,
-                surroundings,
-                trajectory,
-                accumulator,
-                array.mount,
-                config.fuse,
-                losses=log.losses,
-            )
-        )
-        power_map = accumulator.power_map()
-    with clock.stage("detect"):
-        if config.detect.method == "sparse":
-            around = ranges_around(surroundings, trajectory, scans.time_ns, array.mount)
-            sources = fitted_sources(
-                scans, around, trajectory, array, config.scan, config.detect, room=room
-            )
-            sources = with_level_errors(sources, scans, trajectory, array, room, config.scan)
-        else:
-            sources = detect_sources(power_map, config.detect)
-    return Run(
-        log=log_path,
-        fingerprint=log.fingerprint,
-        config=config,
+    return Measured(
         room=room,
         trajectory=trajectory,
         scans=scans,
-        power_map=power_map,
-        sources=sources,
+        surroundings=surroundings,
+        array=array,
         losses=tuple(log.losses),
-        counts=_counts(log, len(trajectory.of_scans()), len(scans), fused),
-        timings_s=clock.timings_s,
+        scanners=len(log.scanners),
+        odometry_poses=len(log.odometry),
+        fingerprint=log.fingerprint,
         duration_s=log.duration_s,
-        offsets=offsets,
     )
 
 
@@ -221,13 +284,3 @@ def _watched(log: RobotLog, stage: Stage) -> Iterator[AudioBlock | LaserScan]:
             stage.advance_to((item.time_ns - start_ns) * 1e-9)
             reported_ns = item.time_ns
         yield item
-
-
-def _counts(log: RobotLog, poses: int, scans: int, fused: int) -> dict[str, int]:
-    return {
-        "laser scanners": len(log.scanners),
-        "odometry poses": len(log.odometry),
-        "laser scans used": poses,
-        "audio scans": scans,
-        "audio scans fused": fused,
-    }

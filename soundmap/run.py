@@ -46,6 +46,8 @@ class Run:
     offsets : ArrayOffsets or None
         How far the array's clock and yaw were off; scans and mount are corrected by what was clear.
         None if it was not asked for.
+    from_cache : bool
+        Whether everything up to the trajectory is what an earlier run has kept.
     """
 
     log: Path
@@ -61,6 +63,7 @@ class Run:
     timings_s: dict[str, float]
     duration_s: float
     offsets: ArrayOffsets | None = None
+    from_cache: bool = False
 
 
 @dataclass(frozen=True)

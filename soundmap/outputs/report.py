@@ -54,7 +54,7 @@ def run_report(run: Run, timings_s: Mapping[str, float]) -> dict[str, Any]:
         "log_path": str(run.log.absolute()),
         "fingerprint": run.fingerprint,
         "duration_s": run.duration_s,
-        "speed": run.duration_s / spent if spent > 0 else None,
+        "speed": run.duration_s / spent if spent > 0 and not run.from_cache else None,
         "level_reference": str(run.sources.reference),
         "sources": source_rows(run.sources),
         "reflections": reflection_rows(run.sources),
@@ -63,6 +63,7 @@ def run_report(run: Run, timings_s: Mapping[str, float]) -> dict[str, Any]:
         "counts": dict(run.counts),
         "losses": [dataclasses.asdict(loss) for loss in run.losses],
         "timings_s": dict(timings_s),
+        "from_cache": run.from_cache,
         "config": run.config.model_dump(mode="json", exclude_none=True),
     }
 

@@ -46,12 +46,17 @@ def run_view(report: Mapping[str, Any]) -> RenderableType:
                 "Trajectory": f"{way['length_m']:.2f} m, {way['poses']} poses, {usable} usable",
                 "Array": array_text(report.get("array")),
                 "Used": ", ".join(f"{count} {_words(name)}" for name, count in _counts(report)),
-                "Time": _times(report["timings_s"]),
+                "Time": _times(report["timings_s"]) + _cached(report),
                 "Files": f"{report['folder']}/, to begin with report.html",
             }
         ),
         *_losses(report["losses"]),
     )
+
+
+def _cached(report: Mapping[str, Any]) -> str:
+    kept = "; scans, map and trajectory are those of an earlier run (--no-cache measures again)"
+    return kept if report.get("from_cache") else ""
 
 
 def diff_view(report: Mapping[str, Any]) -> RenderableType:
