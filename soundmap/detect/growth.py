@@ -88,7 +88,11 @@ def _bring_into_view(fit: SparseFit) -> None:
     some scans and not for others is a source behind something that stands in the room.
     """
     for image in [c for c in fit.components if c.kind == Kind.IMAGE]:
-        kept, worth = copy.copy(fit.components), fit.gain(fit.components.index(image))
+        # Refitting for an earlier one may have done away with this one.
+        place = next((i for i, c in enumerate(fit.components) if c is image), None)
+        if place is None:
+            continue
+        kept, worth = copy.copy(fit.components), fit.gain(place)
         fit.components = [c for c in kept if c is not image]
         source = fit.add(image.place_m, image.height_m, Kind.SOURCE)
         enough = effective_number(source.paths.gain[Path.DIRECT]) > LEAST_SCANS
