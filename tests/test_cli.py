@@ -47,7 +47,7 @@ def processed(monkeypatch, tmp_path, _no_pictures) -> list[dict]:
     monkeypatch.chdir(tmp_path)
     calls: list[dict] = []
 
-    def process(log, map_path, config, *, start_pose, progress):
+    def process(log, map_path, config, *, start_pose, cache, progress):
         calls.append({"log": log, "map": map_path, "config": config, "start": start_pose})
         with progress.stage("localize", 20.0) as stage:
             stage.advance_to(3.0)
