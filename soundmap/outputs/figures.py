@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 from soundmap.change import Change, ChangeKind, PowerRatio
 from soundmap.geometry import FloatArray, Trajectory
 from soundmap.grid import GridFrame, OccupancyGrid
-from soundmap.outputs.floor import DOUBTFUL, FOUND, FloorPlan, Mark, Places, area_of_interest
+from soundmap.outputs.area import area_of_interest
+from soundmap.outputs.floor import DOUBTFUL, FOUND, FloorPlan, Mark, Places
 from soundmap.run import Run
 from soundmap.sound import SourceList, decibels
 

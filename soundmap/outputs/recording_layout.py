@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import rerun.blueprint as rrb
 
-from soundmap.outputs.floor import Area
+from soundmap.outputs.area import Area
 
 BACKGROUND = (24, 27, 33, 255)
 WHOLE, OVER_TIME = "What was found", "How it went"

@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage, imread
 
 from soundmap.grid import GridFrame
+from soundmap.outputs.area import Area, area_of_interest, cropped
 from soundmap.outputs.figures import power_map_figure, power_ratio_figure, trajectory_figure
-from soundmap.outputs.floor import Area, area_of_interest, cropped
 from soundmap.outputs.picture_format import PictureFormat
 from soundmap.outputs.pictures import picture_bytes
 from soundmap.sound import LevelReference, PowerMap, Source, SourceList

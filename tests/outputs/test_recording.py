@@ -10,12 +10,8 @@ from handmade import START_NS, fitted_run, made_ratio, made_run, unlucky_run, wa
 from rerun.chunk import RrdReader
 
 from soundmap.geometry import Mount
-from soundmap.outputs.recording import (
-    difference_markdown,
-    run_markdown,
-    run_recording,
-    write_difference_recording,
-)
+from soundmap.outputs.markdown import difference_markdown, run_markdown
+from soundmap.outputs.recording import run_recording, write_difference_recording
 from soundmap.outputs.stored_run import StoredDifference
 
 
