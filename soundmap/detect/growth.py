@@ -88,11 +88,9 @@ def _bring_into_view(fit: SparseFit) -> None:
     some scans and not for others is a source behind something that stands in the room.
     """
     for image in [c for c in fit.components if c.kind == Kind.IMAGE]:
-        # Refitting for an earlier one may have done away with this one.
-        place = next((i for i, c in enumerate(fit.components) if c is image), None)
-        if place is None:
+        if image not in fit.components:  # silent since an earlier one became a source
             continue
-        kept, worth = copy.copy(fit.components), fit.gain(place)
+        kept, worth = copy.copy(fit.components), fit.gain(fit.components.index(image))
         fit.components = [c for c in kept if c is not image]
         source = fit.add(image.place_m, image.height_m, Kind.SOURCE)
         enough = effective_number(source.paths.gain[Path.DIRECT]) > LEAST_SCANS
@@ -100,21 +98,20 @@ def _bring_into_view(fit: SparseFit) -> None:
             fit.refit()
             for _ in range(STEPS):
                 fit.move([source])
-        present = any(c is source for c in fit.components)
-        if not present or not enough or fit.gain(len(fit.components) - 1) < IN_VIEW_SHARE * worth:
+        present = enough and source in fit.components
+        if not present or fit.gain(fit.components.index(source)) < IN_VIEW_SHARE * worth:
             fit.components = kept
             fit.refit()
 
 
 def _merge(fit: SparseFit) -> None:
     """Put one component in the place of two where it explains nearly as much."""
-    tried: set[tuple[int, int]] = set()
+    tried: list[tuple[Component, Component]] = []
     while (pair := _nearest_pair(fit.components, tried)) is not None:
         first, second = pair
-        tried.add((id(first), id(second)))
+        tried.append(pair)
         before, kept = fit.misfit, copy.copy(fit.components)
-        index = {id(component): i for i, component in enumerate(kept)}
-        worth = min(fit.gain(index[id(first)]), fit.gain(index[id(second)]))
+        worth = min(fit.gain(kept.index(each)) for each in pair)
         weight = np.array([_energy(fit, first), _energy(fit, second)])
         share = weight / max(weight.sum(), 1e-30)
         louder = first if weight[0] >= weight[1] else second
@@ -130,14 +127,14 @@ def _merge(fit: SparseFit) -> None:
 
 
 def _nearest_pair(
-    components: list[Component], tried: set[tuple[int, int]]
+    components: list[Component], tried: list[tuple[Component, Component]]
 ) -> tuple[Component, Component] | None:
     """The two components nearest to each other that may be one and were not tried yet."""
     best, least = None, ONE_SOURCE_M
     for index, first in enumerate(components):
         for second in components[:index]:
             away = float(np.hypot(*(first.place_m - second.place_m)))
-            if away < least and (id(first), id(second)) not in tried:
+            if away < least and (first, second) not in tried:
                 best, least = (first, second), away
     return best
 
