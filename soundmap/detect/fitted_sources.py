@@ -3,9 +3,8 @@ r"""From all audio scans of a run to its sources and their mirror images, by a s
 A component of the fit counts as a source if it explains more than chance and the model's own
 imperfection would:
 
-- *Chance*: the residual of each stretch of the way is turned by an angle of its own, which keeps
-  all that was heard but where it came from. The best candidate of many such runs follows a Gumbel
-  distribution.
+- *Chance*: the residual of each scan is turned by an angle of its own, which keeps all that was
+  heard but where it came from. The best candidate of many such runs follows a Gumbel distribution.
 - *Imperfection*: what a loud source leaves unexplained may look like a weak one, in proportion to
   how much it explains itself. What ghosts of simulated rooms explained falls off exponentially.
 
@@ -121,7 +120,7 @@ def _found(
     if not fit.components:
         return [], []
     told = _told(fit, surface, surface_odds(surface, room))
-    chance = chance_distribution(fit, candidates, _stretches(evidence))
+    chance = chance_distribution(fit, candidates)
     gains = np.array([each.gain for each in told])
     on_surface = np.array([each.placement.on_surface for each in told])
     probability = _by_index(told, false_alarm_probabilities(gains, on_surface, chance))

@@ -13,6 +13,7 @@ each scan; a place then takes one look into them a scan.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numba import njit, prange
@@ -53,22 +54,32 @@ class MatchedScans:
 
 def matched_scans(evidence: Evidence, residual: Single, precision: Precision) -> MatchedScans:
     """Products of a residual (S, D) with all beams."""
+    weighted = precision.times(residual)
+    return MatchedScans(beam_matches(evidence, weighted), beam_energies(evidence, precision))
+
+
+def beam_matches(evidence: Evidence, weighted: Single) -> Single:
+    r"""Products of all beams with :math:`\Sigma^{-1} r` (S, D), shape (S, B, E, M)."""
     beams, starts = evidence.table.beams, evidence.table.starts
     apertures, waves, _ = beams.shape
-    scans, bands = len(evidence), evidence.sub_bands
-    weighted = precision.times(residual)
-    match = np.empty((scans, bands, apertures, waves), dtype=np.float32)
-    energy = np.empty((scans, bands, len(CLASSES), waves // COARSE), dtype=np.float32)
+    match = np.empty((len(evidence), evidence.sub_bands, apertures, waves), dtype=np.float32)
+    for band, (start, stop) in enumerate(pairwise(starts)):
+        beam = beams[:, :, start:stop].reshape(apertures * waves, -1)
+        match[:, band] = (weighted[:, start:stop] @ beam.T).reshape(-1, apertures, waves)
+    return match
+
+
+def beam_energies(evidence: Evidence, precision: Precision) -> Single:
+    r"""Products :math:`b^T \Sigma^{-1} b` of a few beams, shape (S, B, classes, M / COARSE)."""
+    beams, starts = evidence.table.beams, evidence.table.starts
+    count = beams.shape[1] // COARSE
+    energy = np.empty((len(evidence), evidence.sub_bands, len(CLASSES), count), dtype=np.float32)
     for band, inverse in enumerate(precision.inverse):
-        own = slice(starts[band], starts[band + 1])
-        beam = beams[:, :, own]
-        match[:, band] = (weighted[:, own] @ beam.reshape(apertures * waves, -1).T).reshape(
-            scans, apertures, waves
-        )
         for index, aperture in enumerate(CLASSES):
-            few = np.ascontiguousarray(beam[aperture, : waves // COARSE * COARSE : COARSE])
+            few = beams[aperture, : count * COARSE : COARSE, starts[band] : starts[band + 1]]
+            few = np.ascontiguousarray(few)
             energy[:, band, index] = np.einsum("smd,md->sm", np.matmul(few, inverse), few)
-    return MatchedScans(match, energy)
+    return energy
 
 
 def explained(

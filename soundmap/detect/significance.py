@@ -8,7 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soundmap.detect.candidates import Candidates
-from soundmap.detect.matched_filter import explained, matched_scans
+from soundmap.detect.matched_filter import (
+    MatchedScans,
+    beam_energies,
+    beam_matches,
+    explained,
+)
 from soundmap.detect.sound_paths import Kind
 from soundmap.detect.sparse_fit import SparseFit
 from soundmap.geometry import FloatArray
@@ -27,30 +32,22 @@ GHOST_RATE = 0.02
 """Runs that have a ghost of exactly that size or more."""
 
 
-def chance_distribution(
-    fit: SparseFit, candidates: Candidates, stretch: NDArray[np.int64]
-) -> tuple[float, float]:
+def chance_distribution(fit: SparseFit, candidates: Candidates) -> tuple[float, float]:
     """Location and scale of the Gumbel distribution of what the best candidate explains by chance.
 
-    From the fit's residual, each stretch of the way turned by an angle of its own.
-
-    Parameters
-    ----------
-    fit : SparseFit
-    candidates : Candidates
-    stretch : ndarray of int, shape (S,)
-        Number of the stretch of each scan.
+    From what the fit leaves, weighted as candidates see it, each scan turned by an angle of its
+    own.
     """
     rng = np.random.default_rng(CHANCE_SEED)
     stride = max(len(fit.evidence) // SCANS, 1)
     few = np.arange(0, len(fit.evidence), stride)
     evidence = fit.evidence.chosen(few)
-    alone = SparseFit(evidence, fit.walls)
+    energy = beam_energies(fit.evidence, fit.precision)[few]
+    weighted = fit.precision.times(fit.residual)[few]
     best = []
     for _ in range(CHANCE_RUNS):
-        angle = rng.uniform(0.0, 2.0 * np.pi, int(stretch.max()) + 1)[stretch[few]]
-        residual = _turned(fit.residual[few], fit, angle)
-        matched = matched_scans(evidence, residual, alone.precision)
+        turned = _turned(weighted, fit, rng.uniform(0.0, 2.0 * np.pi, len(few)))
+        matched = MatchedScans(beam_matches(evidence, turned), energy)
         value = explained(evidence, matched, candidates.source_m, Kind.SOURCE)
         best.append(stride * float(value.max(initial=0.0)))
     scale = max(float(np.std(best, ddof=1)) * np.sqrt(6.0) / np.pi, 1e-12)
@@ -58,15 +55,15 @@ def chance_distribution(
 
 
 def _turned(
-    residual: NDArray[np.float32], fit: SparseFit, angle_rad: FloatArray
+    weighted: NDArray[np.float32], fit: SparseFit, angle_rad: FloatArray
 ) -> NDArray[np.float32]:
     """Scans as an array turned by some angle would have heard them."""
     starts = fit.evidence.table.starts
-    turned = np.empty_like(residual)
+    turned = np.empty_like(weighted)
     for start, stop in pairwise(starts):
         middle = (start + stop) // 2
         order = 1 + np.arange(middle - start)
-        series = residual[:, start:middle] + 1j * residual[:, middle:stop]
+        series = weighted[:, start:middle] + 1j * weighted[:, middle:stop]
         series = series * np.exp(1j * order * angle_rad[:, None])
         turned[:, start:middle], turned[:, middle:stop] = series.real, series.imag
     return turned
