@@ -55,7 +55,7 @@ def test_only_the_recording_imports_rerun():
         for file in PACKAGE.rglob("*.py")
         if any(name.split(".")[0] == "rerun" for name in imports(file))
     }
-    assert users == {"recording.py", "recording_layout.py"}
+    assert users == {"recording.py", "recording_layout.py", "recording_shapes.py"}
 
 
 def test_the_command_line_loads_nothing_slow_by_itself():

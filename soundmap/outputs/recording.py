@@ -1,52 +1,62 @@
 """A run as a Rerun recording: the way it unfolded in time, and what came of it.
 
-The only import of Rerun. What came of the run is static, so it is seen whatever the time cursor;
+What came of the run is static, so it is seen whatever the time cursor;
 what happened lies on the log's own time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
 import rerun as rr
-from matplotlib import colormaps
 from numpy.typing import ArrayLike, NDArray
 
 from soundmap.change import ChangeKind
 from soundmap.geometry import FloatArray
-from soundmap.grid import GridFrame, OccupancyGrid
+from soundmap.grid import GridFrame
 from soundmap.outputs.area import Area, area_of_interest, cropped
 from soundmap.outputs.figures import PALE, SURE, not_below, shown_range
 from soundmap.outputs.markdown import difference_markdown, run_markdown
 from soundmap.outputs.recording_layout import difference_layout, run_layout
+from soundmap.outputs.recording_shapes import (
+    BLUE,
+    DARK,
+    GREEN,
+    GREY,
+    LINE_Z,
+    POWER_Z,
+    PURPLE,
+    VERMILION,
+    as_points,
+    circle,
+    coloured,
+    draw_ellipses,
+    draw_floor,
+    draw_images,
+    draw_places,
+    draw_robot,
+    floor_picture,
+    raised,
+)
 from soundmap.outputs.report import change_rows, source_rows
 from soundmap.outputs.stored_run import StoredDifference
 from soundmap.outputs.wording import (
-    ellipse_95,
     flags_text,
     level_text,
     ratio_text,
 )
 from soundmap.run import Run
-from soundmap.sound import PowerMap, SourceList, decibels
+from soundmap.sound import PowerMap, decibels
 
 APPLICATION = "soundmap"
 TIMELINE = "time"
-FLOOR_Z, POWER_Z, LINE_Z = 0.0, 0.01, 0.03
-"""Heights at which flat things are drawn, one above the other [m]."""
-WALL_RGBA, OPEN_RGBA, UNKNOWN_RGBA = (90, 95, 105, 255), (236, 238, 240, 255), (34, 38, 46, 255)
-BLUE, VERMILION, GREEN = (0, 114, 178), (213, 94, 0), (0, 158, 115)
-PURPLE, DARK, GREY = (117, 70, 160), (40, 44, 52), (130, 134, 142)
-WHITE = (255, 255, 255)
 SCANNER_COLOURS = MappingProxyType({0: (86, 180, 233), 1: (230, 159, 0), 2: (204, 121, 167)})
 LEAST_LOBE_M, GREATEST_LOBE_M = 0.25, 1.0
 """Radius at which the polar curve of an audio scan shows the quietest and the loudest level."""
-ROBOT_M, RING_M = 0.2, 0.18
-"""Radius of the robot, and of the ring round a source [m]."""
 TRAJECTORY_STEPS, TRAJECTORY_POINTS = 200, 400
 ROWS_A_BATCH = 256
 ELLIPSE_SIGMAS = 2.0
@@ -89,7 +99,7 @@ class RunRecording:
         self._low, self._high = shown_range(self._level)
         measured = run.power_map.frame.centres(np.argwhere(run.power_map.visits > 0))
         self._measured = _bounding_area(measured, run.power_map.frame)
-        _draw_floor(stream, run.room)
+        draw_floor(stream, run.room)
         self._draw_results()
         self._draw_trajectory()
         self._draw_scans()
@@ -140,15 +150,15 @@ class RunRecording:
             f"{label} ({remark})" if remark else label
             for label, remark in zip(labels, remarks, strict=True)
         ]
-        _draw_places(stream, places, labels, [VERMILION] * len(places))
-        _draw_ellipses(stream, run.sources)
-        _draw_images(stream, run.sources)
+        draw_places(stream, places, labels, [VERMILION] * len(places))
+        draw_ellipses(stream, run.sources)
+        draw_images(stream, run.sources)
 
     def _draw_trajectory(self) -> None:
         trajectory, stream = self._run.trajectory, self._stream
         if len(trajectory) == 0:
             return
-        points = _raised(trajectory.pose[:, :2], LINE_Z)
+        points = raised(trajectory.pose[:, :2], LINE_Z)
         for name, wanted, colour in (
             ("trajectory", trajectory.usable, BLUE),
             ("trajectory_not_to_be_trusted", ~trajectory.usable, VERMILION),
@@ -162,10 +172,10 @@ class RunRecording:
         half = trajectory.pose[:, 2] / 2.0
         zero = np.zeros_like(half)
         turn = np.stack([zero, zero, np.sin(half), np.cos(half)], axis=-1)
-        at = _raised(trajectory.pose[:, :2], 0.0)
+        at = raised(trajectory.pose[:, :2], 0.0)
         columns = rr.Transform3D.columns(translation=at, quaternion=turn)
         self._send("/world/robot", time_ns, columns)
-        _draw_robot(stream)
+        draw_robot(stream)
         trusted = trajectory.usable.astype(np.float64)
         self._send_series("/plots/pose/trusted", time_ns, trusted, GREEN)
         self._draw_uncertainty()
@@ -178,10 +188,10 @@ class RunRecording:
             return
         values, axes = np.linalg.eigh(covariance[:, :2, :2])
         reach = ELLIPSE_SIGMAS * np.sqrt(np.maximum(values, 0.0))
-        ellipses = (_circle(1.0)[:, :2] * reach[:, None, :]) @ np.swapaxes(axes, 1, 2)
+        ellipses = (circle(1.0)[:, :2] * reach[:, None, :]) @ np.swapaxes(axes, 1, 2)
         at = ellipses + trajectory.pose[:, None, :2]
         self._send_curves(
-            "/world/run/pose_uncertainty", trajectory.time_ns, _raised(at, LINE_Z), GREEN
+            "/world/run/pose_uncertainty", trajectory.time_ns, raised(at, LINE_Z), GREEN
         )
         spread = np.sqrt(np.maximum(values.sum(axis=1), 0.0))
         self._send_series("/plots/pose/spread_m", trajectory.time_ns, spread, VERMILION)
@@ -220,7 +230,7 @@ class RunRecording:
         towards = np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
         curves = scans.mount.translation_m[:2] + radius[:, :, None] * towards
         curves = np.concatenate([curves, curves[:, :1]], axis=1)
-        curves = _raised(curves, float(scans.mount.translation_m[2]))
+        curves = raised(curves, float(scans.mount.translation_m[2]))
         self._send_curves("/world/robot/audio_scan", scans.time_ns, curves, PURPLE)
 
     def _send_lasers(self, scanner: int) -> None:
@@ -229,7 +239,7 @@ class RunRecording:
             return
         time_ns = [time for time, _ in waiting]
         counts = [len(points) for _, points in waiting]
-        points = _raised(np.concatenate([points for _, points in waiting]), 2.0 * LINE_Z)
+        points = raised(np.concatenate([points for _, points in waiting]), 2.0 * LINE_Z)
         columns = rr.Points3D.columns(positions=points).partition(counts)
         name = f"/world/run/laser_{scanner + 1}"
         self._send(name, time_ns, columns)
@@ -241,7 +251,7 @@ class RunRecording:
         if not self._hits:
             return
         time_ns = [time for time, _, _ in self._hits]
-        ends = _raised(np.array([pair[1:] for pair in self._hits]), 3.0 * LINE_Z)
+        ends = raised(np.array([pair[1:] for pair in self._hits]), 3.0 * LINE_Z)
         self._send_curves("/world/run/chosen_bearing", time_ns, ends, DARK)
         columns = rr.Points3D.columns(positions=ends[:, 1])
         self._send("/world/run/laser_hit", time_ns, columns.partition([1] * len(ends)))
@@ -255,8 +265,8 @@ class RunRecording:
         share = (not_below(part.astype(np.float64), self._low) - self._low) / (
             self._high - self._low
         )
-        rgba = _coloured(np.clip(share, 0.0, 1.0), "viridis")
-        grid = _grid(rgba, frame.resolution_m, (left, bottom), POWER_Z)
+        rgba = coloured(np.clip(share, 0.0, 1.0), "viridis")
+        grid = floor_picture(rgba, frame.resolution_m, (left, bottom), POWER_Z)
         if time_ns is None:
             self._stream.log(name, grid, static=True)
         else:
@@ -289,7 +299,7 @@ class RunRecording:
 @contextmanager
 def run_recording(run: Run, file: Path) -> Iterator[RunRecording]:
     """A file with everything about a run; what the log tells is added in the ``with`` block."""
-    seen = [run.trajectory.pose[:, :2], _places([(s.x_m, s.y_m) for s in run.sources])]
+    seen = [run.trajectory.pose[:, :2], as_points([(s.x_m, s.y_m) for s in run.sources])]
     with recording(file, run_layout(area_of_interest(seen, run.room))) as stream:
         drawn = RunRecording(stream, run)
         yield drawn
@@ -301,125 +311,32 @@ def write_difference_recording(difference: StoredDifference, file: Path) -> None
     ratio = difference.ratio
     places = [(change.x_m, change.y_m) for change in ratio.changes]
     measured = ratio.frame.centres(np.argwhere(~np.isnan(ratio.ratio_db)))
-    area = area_of_interest([measured, _places(places)], difference.room)
+    area = area_of_interest([measured, as_points(places)], difference.room)
     with recording(file, difference_layout(area)) as stream:
         if difference.room is not None:
-            _draw_floor(stream, difference.room)
+            draw_floor(stream, difference.room)
         reach = float(np.clip(np.nanmax(np.abs(ratio.ratio_db), initial=0.0), 3.0, 20.0))
         shown = _bounding_area(measured, ratio.frame)
         part, (left, _, bottom, _) = cropped(ratio.ratio_db, ratio.frame, shown)
         share = np.clip(part.astype(np.float64) / (2.0 * reach) + 0.5, 0.0, 1.0)
-        rgba = _coloured(share, "RdBu_r")
+        rgba = coloured(share, "RdBu_r")
         if ratio.chance is not None:
             sure, _ = cropped(ratio.chance < SURE, ratio.frame, shown)
             rgba[~sure.astype(bool), 3] = (PALE * rgba[~sure.astype(bool), 3]).astype(np.uint8)
-        grid = _grid(rgba, ratio.frame.resolution_m, (left, bottom), POWER_Z)
+        grid = floor_picture(rgba, ratio.frame.resolution_m, (left, bottom), POWER_Z)
         stream.log("/world/result/power_ratio", grid, static=True)
         labels = [
             f"{row['id']}  {row['kind']}"
             + ("" if change.kind == ChangeKind.UNTOLD else f"  {ratio_text(row)} dB")
             for row, change in zip(change_rows(ratio.changes), ratio.changes, strict=True)
         ]
-        _draw_places(stream, places, labels, [_change_colour(c.kind) for c in ratio.changes])
+        draw_places(stream, places, labels, [_change_colour(c.kind) for c in ratio.changes])
         text = difference_markdown(difference)
         stream.log("/summary", rr.TextDocument(text, media_type="text/markdown"), static=True)
 
 
-def _draw_floor(stream: rr.RecordingStream, room: OccupancyGrid) -> None:
-    rgba = np.empty((*room.frame.shape, 4), dtype=np.uint8)
-    rgba[:] = UNKNOWN_RGBA
-    rgba[room.free], rgba[room.occupied] = OPEN_RGBA, WALL_RGBA
-    grid = _grid(rgba, room.frame.resolution_m, room.frame.origin_m, FLOOR_Z)
-    stream.log("/world/map", grid, static=True)
-
-
-def _draw_robot(stream: rr.RecordingStream) -> None:
-    """A disc with a line to its front."""
-    height = np.array([0.0, 0.0, LINE_Z])
-    front = np.array([[0.0, 0.0, 0.0], [ROBOT_M, 0.0, 0.0]])
-    lines = [_circle(ROBOT_M) + height, front + height]
-    body = rr.LineStrips3D(lines, colors=[GREEN], radii=rr.Radius.ui_points(2.0))
-    stream.log("/world/robot/body", body, static=True)
-
-
-def _draw_places(
-    stream: rr.RecordingStream,
-    places_m: Sequence[tuple[float, float]],
-    labels: Sequence[str],
-    colours: Sequence[tuple[int, int, int]],
-) -> None:
-    """Labelled points on the floor, static; an empty list draws nothing."""
-    if not places_m:
-        return
-    at = _raised(_places(places_m), 4.0 * LINE_Z)
-    dots = rr.Points3D(at, colors=list(colours), radii=rr.Radius.ui_points(2.5))
-    stream.log("/world/result/sources", dots, static=True)
-    rings = rr.LineStrips3D(
-        list(_circle(RING_M) + at[:, None, :]),
-        colors=list(colours),
-        radii=rr.Radius.ui_points(1.5),
-    )
-    stream.log("/world/result/source_rings", rings, static=True)
-    # a label has the colour of its point: white ones are read best, and need no dot
-    names = rr.Points3D(at, colors=[WHITE], radii=[0.0], labels=list(labels), show_labels=True)
-    stream.log("/world/result/source_labels", names, static=True)
-
-
-def _draw_ellipses(stream: rr.RecordingStream, sources: SourceList) -> None:
-    """Where the sources lie with 95 %, as far as that is known."""
-    lines = [
-        _raised(np.array([source.x_m, source.y_m]) + ellipse_95(source.fit.covariance_m2), 0.13)
-        for source in sources
-        if source.fit is not None
-    ]
-    if lines:
-        ellipses = rr.LineStrips3D(lines, colors=[VERMILION], radii=rr.Radius.ui_points(1.0))
-        stream.log("/world/result/source_ellipses", ellipses, static=True)
-
-
-def _draw_images(stream: rr.RecordingStream, sources: SourceList) -> None:
-    """Mirror images; whose they are shows when one is pointed at."""
-    images = sources.reflections
-    if not images:
-        return
-    at = _raised(_places([(image.x_m, image.y_m) for image in images]), 4.0 * LINE_Z)
-    owners = ["" if image.source is None else f" of S{image.source + 1}" for image in images]
-    labels = [f"mirror image{owner}" for owner in owners]
-    dots = rr.Points3D(
-        at, colors=[GREY], radii=rr.Radius.ui_points(3.0), labels=labels, show_labels=False
-    )
-    stream.log("/world/result/mirror_images", dots, static=True)
-
-
 def _change_colour(kind: ChangeKind) -> tuple[int, int, int]:
     return VERMILION if kind.is_louder else BLUE if kind.is_quieter else GREY
-
-
-def _grid(
-    rgba: NDArray[np.uint8], cell_m: float, corner_m: tuple[float, float], z_m: float
-) -> rr.GridMap:
-    """A picture on the floor; the rows of a `GridMap` run from the top down."""
-    rows, columns = rgba.shape[:2]
-    is_opaque = bool((rgba[..., 3] == 255).all())
-    form = rr.components.ImageFormat(
-        width=columns, height=rows, color_model="RGBA", channel_datatype="U8"
-    )
-    return rr.GridMap(
-        data=np.ascontiguousarray(rgba[::-1]).tobytes(),
-        format=form,
-        cell_size=cell_m,
-        translation=[*corner_m, z_m],
-        opacity=None if is_opaque else 0.999,  # below 1, or what is transparent is drawn black
-        draw_order=z_m,
-    )
-
-
-def _coloured(share: FloatArray, colours: str) -> NDArray[np.uint8]:
-    """Colours of a scale from 0 to 1, shape (H, W, 4); NaN is transparent."""
-    seen = ~np.isnan(share)
-    rgba = np.asarray(colormaps[colours](np.where(seen, share, 0.0), bytes=True), dtype=np.uint8)
-    rgba[~seen] = 0
-    return rgba
 
 
 def _stretches(wanted: NDArray[np.bool_]) -> list[slice]:
@@ -449,18 +366,3 @@ def _bounding_area(points: FloatArray, frame: GridFrame) -> Area:
         points = np.array([frame.origin_m]) + 0.5 * frame.resolution_m
     (left, bottom), (right, top) = points.min(axis=0), points.max(axis=0)
     return Area(float(left), float(right), float(bottom), float(top))
-
-
-def _circle(radius_m: float) -> FloatArray:
-    """A closed line round the origin, flat, shape (41, 3)."""
-    angle = np.linspace(0.0, 2.0 * np.pi, 41)
-    return _raised(radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1), 0.0)
-
-
-def _raised(points: FloatArray, z_m: float) -> FloatArray:
-    """x, y, z from x, y, any leading axes."""
-    return np.concatenate([points, np.full((*points.shape[:-1], 1), z_m)], axis=-1)
-
-
-def _places(places: Sequence[tuple[float, float]]) -> FloatArray:
-    return np.array(places, dtype=np.float64).reshape(-1, 2)
