@@ -22,8 +22,12 @@ MOST_MERGED = 20
 LARGEST_WEIGHT = 4.0
 """However long the robot rests, a place counts no more than this many scans."""
 LONG_RUN_SCANS = 1200
-"""In longer runs, scans from nearly the same pose are one whenever they were taken."""
+"""Of longer runs, no more than some scans of nearly the same pose are used, ..."""
 SAME_M, SAME_RAD = 0.12, np.radians(10.0)
+MOST_LOOKS = (16, 8, 4, 2)
+"""... of these numbers the greatest that leaves no more than that many, if any does. They are not
+merged: the fit knows how single scans scatter, not how their means do."""
+GOLDEN_SHARE = 0.6180339887498949
 SCANS_AT_ONCE = 4000
 MOST_TURN_RAD = np.radians(12.0)
 
@@ -131,7 +135,9 @@ def gathered_evidence(
     axis = np.asarray(wrapped_angle(heading + mount.yaw_rad))
     group = _rests(place, axis)
     if len(group) and group[-1] >= LONG_RUN_SCANS:
-        group = _same_poses(place, axis)
+        kept = _seldom_seen(place, axis, group)
+        chosen, place, axis, turn = chosen[kept], place[kept], axis[kept], turn[kept]
+        group = np.unique(group[kept], return_inverse=True)[1].astype(np.int64)
     first, count = _firsts(group)
     mean = parts[chosen].mean(axis=2, dtype=np.float64)
     table = beam_table(
@@ -175,13 +181,30 @@ def _rests(place_m: FloatArray, axis_rad: FloatArray) -> NDArray[np.int64]:
     return group
 
 
-def _same_poses(place_m: FloatArray, axis_rad: FloatArray) -> NDArray[np.int64]:
-    """For each scan its pose, of those that were taken, in the order in which they came up."""
+def _seldom_seen(
+    place_m: FloatArray, axis_rad: FloatArray, group: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    """Which scans to use of a long run: those of some groups from each pose, evenly in time."""
+    first, _ = _firsts(group)
     cell = np.column_stack(
-        [np.floor(place_m / SAME_M), np.floor(np.asarray(wrapped_angle(axis_rad)) / SAME_RAD)]
+        [
+            np.floor(place_m[first] / SAME_M),
+            np.floor(np.asarray(wrapped_angle(axis_rad[first])) / SAME_RAD),
+        ]
     )
-    _, first, index = np.unique(cell, axis=0, return_index=True, return_inverse=True)
-    return np.argsort(np.argsort(first))[index.ravel()].astype(np.int64)
+    _, pose, looks = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
+    pose = pose.ravel()
+    order = np.argsort(pose, kind="stable")
+    number = np.empty(len(pose), dtype=np.int64)  # of a look among those from its pose
+    number[order] = np.arange(len(pose)) - np.repeat(np.cumsum(looks) - looks, looks)
+    for most in MOST_LOOKS:
+        wanted = np.minimum(looks, most)
+        if wanted.sum() <= LONG_RUN_SCANS:
+            break
+    share = (wanted / looks)[pose]
+    begin = pose * GOLDEN_SHARE % 1.0  # not the same laps everywhere
+    used = np.floor((number + 1) * share + begin) > np.floor(number * share + begin)
+    return np.asarray(used[group])
 
 
 def _firsts(group: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
