@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from soundmap.logs.audio_messages import PACKET_READERS, block_samples
 from soundmap.logs.audio_stream import AudioStream
-from soundmap.logs.reader import McapLog, Message
+from soundmap.logs.reader import McapLog
+from soundmap.logs.records import Message
 from soundmap.logs.survey import AudioRecord, Survey
 from soundmap.losses import LossLedger
 from soundmap.sensors import AudioBlock

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from soundmap.logs.reader import Channel
+from soundmap.logs.records import Channel
 
 MAX_MESSAGE_BYTES = 64 * 2**20
 """A packed message that would expand to more than this is taken for damaged."""

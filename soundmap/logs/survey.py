@@ -23,7 +23,8 @@ from soundmap.logs.audio_messages import (
 from soundmap.logs.laser_messages import SWEEP_READERS, LaserSweep, has_return, valid_ranges
 from soundmap.logs.messages import KINDS, Form, Kind, form_of
 from soundmap.logs.odometry import OdometryRecord
-from soundmap.logs.reader import Channel, McapLog, Message
+from soundmap.logs.reader import McapLog
+from soundmap.logs.records import Channel, Message
 from soundmap.logs.schemas import Decoder, MessageError, MessageType, SchemaError, message_type
 from soundmap.logs.stamps import DAMAGED
 from soundmap.logs.transforms import TRANSFORM_READERS, TransformRecord

@@ -15,7 +15,8 @@ from mcap.writer import CompressionType, IndexType
 
 from soundmap.errors import LogError
 from soundmap.logs.log_files import log_files
-from soundmap.logs.reader import KnownChunk, McapLog
+from soundmap.logs.reader import McapLog
+from soundmap.logs.records import KnownChunk
 from soundmap.losses import LossLedger
 
 SHARED = Path(__file__).parents[2] / ".." / "shared" / "data" / "mcap"

@@ -3,7 +3,7 @@
 import pytest
 
 from soundmap.logs.messages import Form, form_of
-from soundmap.logs.reader import Channel
+from soundmap.logs.records import Channel
 from soundmap.logs.schemas import SchemaError, message_type
 
 SEPARATOR = "=" * 80 + "\n"
