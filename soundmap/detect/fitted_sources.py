@@ -1,14 +1,8 @@
 r"""From all audio scans of a run to its sources and their mirror images, by a sparse fit.
 
-A component of the fit counts as a source if it explains more than chance and the model's own
-imperfection would:
-
-- *Chance*: the residual of each scan is turned by an angle of its own, which keeps all that was
-  heard but where it came from. The best candidate of many such runs follows a Gumbel distribution.
-- *Imperfection*: what a loud source leaves unexplained may look like a weak one, in proportion to
-  how much it explains itself. What ghosts of simulated rooms explained falls off exponentially.
-
-Both give a probability that anything in the run would seem as much of a source.
+A component of the fit counts as a source if it explains more than the model's own imperfection
+would: what a loud source leaves unexplained may look like a weak one. The probability of that is
+told by `soundmap.detect.significance`.
 
 It assumes sources that stand still and sound most of the time, and surfaces that the lasers see.
 It fails where a source moves, where two stand within half a metre of each other, and where a weak
@@ -32,11 +26,7 @@ from soundmap.detect.matched_filter import effective_number
 from soundmap.detect.placement import Placement, placement, surface_odds
 from soundmap.detect.reflections import told_reflections
 from soundmap.detect.regions import Region, regions
-from soundmap.detect.significance import (
-    chance_distribution,
-    chance_probabilities,
-    false_alarm_probabilities,
-)
+from soundmap.detect.significance import false_alarm_probabilities
 from soundmap.detect.sound_paths import Kind, Path
 from soundmap.detect.sparse_fit import Component, SparseFit
 from soundmap.detect.walls import surface_points, wall_lines
@@ -93,7 +83,7 @@ def fitted_sources(
     Returns
     -------
     SourceList
-        Empty if nothing is told from chance.
+        Empty if nothing is told from ghosts.
     """
     evidence = gathered_evidence(scans, around_m, trajectory, array, scan)
     if len(evidence) < LEAST_SCANS:
@@ -120,11 +110,12 @@ def _found(
     if not fit.components:
         return [], []
     told = _told(fit, surface, surface_odds(surface, room))
-    chance = chance_distribution(fit, candidates)
     gains = np.array([each.gain for each in told])
     on_surface = np.array([each.placement.on_surface for each in told])
-    probability = _by_index(told, false_alarm_probabilities(gains, on_surface, chance))
-    by_chance = _by_index(told, chance_probabilities(gains, chance))
+    probability = {
+        each.index: float(value)
+        for each, value in zip(told, false_alarm_probabilities(gains, on_surface), strict=True)
+    }
     sources = [
         _source(fit, each, probability[each.index])
         for each in _strongest_apart(told)
@@ -136,7 +127,7 @@ def _found(
         each.component
         for each in told
         if each.component.kind == Kind.IMAGE
-        and by_chance[each.index] <= rate
+        and probability[each.index] <= rate
         and region.owns(each.component.place_m)
     ]
     return sources, images
@@ -156,11 +147,6 @@ def _told(fit: SparseFit, surface_m: FloatArray, odds: FloatArray) -> list[_Told
         )
     ]
     return sorted(told, key=lambda each: -each.gain)
-
-
-def _by_index(told: Sequence[_Told], values: FloatArray) -> dict[int, float]:
-    """Values of components, by their index in the fit."""
-    return {each.index: float(value) for each, value in zip(told, values, strict=True)}
 
 
 def _strongest_apart(told: Sequence[_Told]) -> list[_Told]:

@@ -28,8 +28,10 @@ AT_ONCE = 4
 MOST_ROUNDS, MOST_COMPONENTS = 14, 16
 ONE_SOURCE_M = 0.75
 """Components nearer to each other than this may be one source."""
+BESIDE_M = 0.3
 IN_VIEW_SHARE = 0.7
-"""An image becomes a source if as such it explains at least this share."""
+"""An image becomes a source if as such it explains at least this share of what it and all within
+`BESIDE_M` of it did."""
 HEIGHTS_TRIED_M = (0.1, 0.3, 0.6, 1.0, 1.4)
 MERGE_SHARE = 0.4
 """They are, if one in their midst loses less than this share of what the lesser of both gains."""
@@ -85,23 +87,26 @@ def _bring_into_view(fit: SparseFit) -> None:
     """Make sources of images that can be heard directly from many places.
 
     Nothing is seen past a mirror image, which lies behind a wall. What lies behind a surface for
-    some scans and not for others is a source behind something that stands in the room.
+    some scans and not for others is a source behind something that stands in the room; what lies
+    on a surface is a source, too, whichever explained a little more. A source takes the place of
+    the image and of what stands beside it, if that loses little.
     """
     for image in [c for c in fit.components if c.kind == Kind.IMAGE]:
         if image not in fit.components:  # silent since an earlier one became a source
             continue
-        kept, worth = copy.copy(fit.components), fit.gain(fit.components.index(image))
-        fit.components = [c for c in kept if c is not image]
+        kept, before = copy.copy(fit.components), fit.misfit
+        others = [c for c in kept if np.hypot(*(c.place_m - image.place_m)) > BESIDE_M]
+        worth = fit.misfit_of(others) - before
+        fit.components = others
         source = fit.add(image.place_m, image.height_m, Kind.SOURCE)
-        enough = effective_number(source.paths.gain[Path.DIRECT]) > LEAST_SCANS
-        if enough:
+        if effective_number(source.paths.gain[Path.DIRECT]) > LEAST_SCANS:
             fit.refit()
             for _ in range(STEPS):
                 fit.move([source])
-        present = enough and source in fit.components
-        if not present or fit.gain(fit.components.index(source)) < IN_VIEW_SHARE * worth:
-            fit.components = kept
-            fit.refit()
+            if source in fit.components and fit.misfit - before < (1.0 - IN_VIEW_SHARE) * worth:
+                continue
+        fit.components = kept
+        fit.refit()
 
 
 def _merge(fit: SparseFit) -> None:

@@ -125,6 +125,10 @@ class SparseFit:
         others = [i for i in range(len(self.components)) if i != index]
         return self._misfit(others) - self.misfit
 
+    def misfit_of(self, components: list[Component]) -> float:
+        """What would be left if there were only some of the components."""
+        return self._misfit([i for i, each in enumerate(self.components) if each in components])
+
     def renew(self) -> None:
         """Model errors as of the present strengths, and strengths as of these errors."""
         self.precision = Precision(self.evidence, self.components)
