@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from soundmap.along_walls import without_hearsay
 from soundmap.config import LocalizeConfig
 from soundmap.geometry import FloatArray, transformed
 from soundmap.grid import OccupancyGrid
@@ -15,8 +16,6 @@ from soundmap.localize.wall_lines import has_line, line_pull, wall_lines
 
 KERNEL_M = 0.15
 """Width of the robust kernel of the points that the map explains [m]."""
-HEARSAY = 0.003
-"""Square of 3 degrees: how well directions of walls are known."""
 MAP_SHARE = 0.1
 """Weight that the map's own cells keep where the run's returns draw a line in them."""
 
@@ -72,33 +71,3 @@ class WallFit:
             return without_hearsay(weight * information + map_information, weight * pull + map_pull)
 
         return by_both
-
-
-def without_hearsay(information: FloatArray, pull: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The evidence of laser scans less what errors of the walls' directions make up.
-
-    Walls that all run one way say nothing about the place along them. Yet their directions are
-    known to about 3 degrees only, and the little that each seems to say of that place would add up
-    over a run to certainty. In the direction in which a scan tells least, `HEARSAY` of what it
-    tells across is taken off.
-
-    Parameters
-    ----------
-    information : ndarray, shape (K, 3, 3)
-    pull : ndarray, shape (K, 3)
-    """
-    a, b, c = information[:, 0, 0], information[:, 0, 1], information[:, 1, 1]
-    across = 0.5 * np.arctan2(2.0 * b, a - c)
-    most = 0.5 * (a + c) + np.hypot(0.5 * (a - c), b)
-    along = np.stack([-np.sin(across), np.cos(across), np.zeros(len(a))], axis=-1)
-    # What is known along the walls whatever the heading is.
-    by_heading = np.einsum("ki,ki->k", along, information[:, :, 2])
-    known = np.einsum("ki,kij,kj->k", along, information, along)
-    known = known - by_heading**2 / np.maximum(information[:, 2, 2], 1e-12)
-    taken = np.clip(known, 0.0, HEARSAY * most)
-    share = taken / np.maximum(known, 1e-12)
-    pulled = np.einsum("ki,ki->k", along, pull)
-    return (
-        information - taken[:, None, None] * along[:, :, None] * along[:, None, :],
-        pull - (share * pulled)[:, None] * along,
-    )

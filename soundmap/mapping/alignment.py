@@ -18,6 +18,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from soundmap.along_walls import without_hearsay
 from soundmap.geometry import FloatArray, composed, relative
 from soundmap.mapping.key_scans import STRIP_M, KeyScan
 
@@ -103,7 +104,8 @@ def pair_fits(
         store.end_m, store.normal, store.first, np.ascontiguousarray(between), pairs, gate_m, stride
     )
     scale = stride * CORRELATION / SIGMA_M**2
-    return PairFits(information * scale, gradient * scale, stride * matched)
+    information, gradient = without_hearsay(scale * information, scale * gradient)
+    return PairFits(information, gradient, stride * matched)
 
 
 @dataclass(frozen=True)

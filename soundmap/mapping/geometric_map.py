@@ -34,6 +34,12 @@ FIRST_GATES_M, FIRST_FINE_ROUNDS = (0.4, 0.3, 0.2), 1
 LAST_GATES_M, LAST_FINE_ROUNDS = (0.25, 0.2, 0.15, 0.12, 0.12, 0.10), 3
 FIRST_LEARNT_M = 8.0
 """Way after which the errors of the odometry are learnt; then each time it has grown by half."""
+FIRM_M = 0.04
+"""Surfaces hold a scan in place if they tell its place in every direction at least this well."""
+UNKNOWN_SCALE = 0.03
+"""What stays unknown of the odometry's scale after it has been learnt [m/m]."""
+MOST_DRIFT_M = 0.2
+"""A pose that may have drifted farther from those that are held in place is not usable."""
 RARE_NS = 200_000_000
 """Where laser scans are farther apart, the trajectory has the poses of the odometry as well."""
 GROWING, RELAXING = 0.7, 0.3
@@ -83,8 +89,8 @@ class BuiltMap:
     room : OccupancyGrid
     trajectory : Trajectory
         Base in the map frame, one pose a laser scan, and one an odometry pose where laser scans
-        are rare; those between key scans are carried there by odometry. Usable unless far from
-        every key scan that fits the map.
+        are rare; those between key scans are carried there by odometry. Usable near key scans that
+        fit the map and are held in place by it, or not far from such.
     facts : MapFacts
     """
 
@@ -156,12 +162,20 @@ def build_map(
         effect="placed by odometry",
         count=int(np.count_nonzero(~graph.matched)),
     )
+    driven_m = np.array([scan.driven_m for scan in keys.scans])
+    held = held_in_place(pose, _of_surfaces(links, len(pose)), driven_m, most_drift_m=MOST_DRIFT_M)
+    losses.add(
+        "laser scan whose surroundings do not tell the way along them",
+        STAGE,
+        effect="pose flagged",
+        count=int(np.count_nonzero(~held)),
+    )
     facts = _facts(keys, pose, links, graph.matched, search, model)
     pose = composed(inverted(pose[0]), pose)
     key_ns = np.array([key.time_ns for key in keys.scans], dtype=np.int64)
     return BuiltMap(
         drawn_map(keys.scans, pose, cell_m=config.cell_m, occupied_share=config.occupied_share),
-        carried_trajectory(keys.time_ns, odometry, key_ns, pose, graph.matched),
+        carried_trajectory(keys.time_ns, odometry, key_ns, pose, graph.matched & held),
         facts,
     )
 
@@ -244,7 +258,7 @@ def _facts(
     search: LoopSearch,
     model: OdometryModel,
 ) -> MapFacts:
-    error = link_errors(pose, links)[len(pose) - 1 :]  # the first links are the odometry's
+    error = link_errors(pose, _of_surfaces(links, len(pose)))
     found = len(error) > 0
     return MapFacts(
         key_scans=len(pose),
@@ -258,6 +272,47 @@ def _facts(
         body_returns=keys.body_returns,
         odometry=_fitted_model(keys.scans, pose, model),
     )
+
+
+def _of_surfaces(links: Links, scans: int) -> Links:
+    """The links that come from surfaces: the first of all are the odometry's."""
+    first = scans - 1
+    return Links(links.pairs[first:], links.measured[first:], links.information[first:])
+
+
+def held_in_place(
+    pose: FloatArray, links: Links, driven_m: FloatArray, *, most_drift_m: float
+) -> NDArray[np.bool_]:
+    """Whether surfaces hold each key scan in every direction, or odometry has not far to carry it.
+
+    Along a corridor without features only odometry tells the way, with `UNKNOWN_SCALE` of error.
+
+    Parameters
+    ----------
+    pose : ndarray, shape (K, 3)
+    links : Links
+        Those that come from surfaces.
+    driven_m : ndarray, shape (K,)
+        Way up to each scan [m].
+    most_drift_m : float
+        Greatest drift of a pose that is still known [m].
+    """
+    heading = pose[links.pairs[:, 1], 2]
+    cos, sin = np.cos(heading), np.sin(heading)
+    turn = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], axis=1)
+    in_map = turn @ links.information[:, :2, :2] @ turn.swapaxes(1, 2)
+    held = np.zeros((len(pose), 2, 2))
+    for end in range(2):
+        np.add.at(held, links.pairs[:, end], in_map)
+    firm = np.linalg.eigvalsh(held)[:, 0] >= FIRM_M**-2.0
+    if not firm.any():
+        return firm
+    after = np.searchsorted(driven_m[firm], driven_m).clip(0, np.count_nonzero(firm) - 1)
+    before = np.maximum(after - 1, 0)
+    away_m = np.minimum(
+        np.abs(driven_m[firm][after] - driven_m), np.abs(driven_m[firm][before] - driven_m)
+    )
+    return UNKNOWN_SCALE * away_m <= most_drift_m
 
 
 def _fitted_model(

@@ -17,7 +17,7 @@ from soundmap.mapping.alignment import Alignment, PointStore, aligned_scan, pair
 from soundmap.mapping.correlation import NearnessGrid, best_placement, nearness_grid
 from soundmap.mapping.founders import place_key
 from soundmap.mapping.key_scans import KeyScan
-from soundmap.mapping.links import odometry_links, scan_links
+from soundmap.mapping.links import WEAKEST, odometry_links, scan_links
 from soundmap.mapping.pose_graph import Links
 from soundmap.odometry_model import OdometryModel
 
@@ -179,7 +179,7 @@ class GrowingGraph:
         pairs = np.stack([np.full(len(targets), len(targets)), np.arange(len(targets))], axis=-1)
         fits = pair_fits(store, pose, pairs, gate_m=GATES_M[-1])
         links = scan_links(pose, pairs, fits, least_matched=LEAST_MATCHED)
-        strength = np.linalg.det(links.information) ** (1.0 / 3.0)
+        strength = np.linalg.det(links.information + WEAKEST * np.eye(3))
         best = np.argsort(-strength, kind="stable")[:MOST_LINKS]
         if len(best) == 0:
             return None

@@ -8,7 +8,6 @@ from soundmap.deskew import deskewed_rays
 from soundmap.geometry import transformed
 from soundmap.grid import GridFrame, OccupancyGrid
 from soundmap.localize.map_fit import map_surface, point_pull
-from soundmap.localize.wall_fit import without_hearsay
 from soundmap.localize.wall_lines import has_line, line_pull, wall_lines
 
 ROOM = worlds.room()
@@ -134,18 +133,3 @@ def test_points_far_from_every_wall_do_not_pull():
     )
     assert not information.any()
     assert not pull.any()
-
-
-def test_what_walls_of_one_direction_seem_to_say_along_them_is_taken_off():
-    normal = np.array([np.sin(0.4), np.cos(0.4), 0.0])
-    along = np.array([np.cos(0.4), -np.sin(0.4), 0.0])
-    turn = np.diag([0.0, 0.0, 5000.0])
-    corridor = 3000.0 * np.outer(normal, normal) + 3.0 * np.outer(along, along) + turn
-    corner = 3000.0 * np.outer(normal, normal) + 900.0 * np.outer(along, along) + turn
-    pull = np.stack([30.0 * normal + 2.0 * along] * 2)
-    information, pulled = without_hearsay(np.stack([corridor, corner]), pull)
-    assert along @ information[0] @ along == pytest.approx(0.0, abs=1e-6)
-    assert along @ pulled[0] == pytest.approx(0.0, abs=1e-6)
-    assert normal @ information[0] @ normal == pytest.approx(3000.0)
-    assert along @ information[1] @ along == pytest.approx(891.0)
-    assert normal @ pulled[1] == pytest.approx(30.0)

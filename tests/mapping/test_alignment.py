@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from soundmap.along_walls import without_hearsay
 from soundmap.geometry import composed, relative, wrapped_angle
 from soundmap.mapping.alignment import (
     CORRELATION,
@@ -48,7 +49,8 @@ def slow_fit(moving, others, between, gate):
         gradient += weight * row * residual
         matched += 1
     scale = CORRELATION / SIGMA_M**2
-    return information * scale, gradient * scale, matched
+    information, gradient = without_hearsay(information[None] * scale, gradient[None] * scale)
+    return information[0], gradient[0], matched
 
 
 def test_the_normal_equations_are_those_of_the_formula(keys):

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -6,7 +8,8 @@ from soundmap.config import MappingConfig
 from soundmap.errors import NothingUsableError
 from soundmap.geometry import Trajectory, composed, transformed
 from soundmap.losses import LossLedger
-from soundmap.mapping.geometric_map import build_map, carried_trajectory
+from soundmap.mapping.geometric_map import build_map, carried_trajectory, held_in_place
+from soundmap.mapping.pose_graph import Links
 from tests import worlds
 from tests.mapping import drives
 
@@ -117,3 +120,39 @@ def test_rare_scans_are_joined_by_the_poses_of_the_odometry():
     found = carried_trajectory(laser_ns, odometry, ends, np.zeros((2, 3)), np.ones(2, bool))
     assert len(found) == 5 + 38
     assert found.of_scans().time_ns.tolist() == laser_ns.tolist()
+
+
+def test_a_corridor_is_as_long_as_odometry_says_and_its_middle_is_flagged():
+    """Scanners that reach 4 m see nothing but two walls over most of 30 m."""
+    turn = np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
+    ring = np.array([[0, 0], [30, 0], [30, 2], [0, 2]]) @ turn.T
+    truth = worlds.driven([tuple(turn @ [1.0, 1.0]), tuple(turn @ [29.0, 1.0])], speed=1.0)
+    mounts = [worlds.FRONT, worlds.BACK]
+    scans = worlds.laser_scans(truth, mounts, rate_hz=8, beams=181, rings=(ring,))
+    scans = [
+        replace(scan, range_m=np.where(scan.range_m < 4.0, scan.range_m, np.nan))
+        for scan in drives.noisy(scans, 0.01)
+    ]
+    odometry, losses = drives.reported(truth, scale=1.02), LossLedger()
+    built = build_map(lambda: scans, odometry, MappingConfig(), losses=losses)
+    track = built.trajectory
+    true = drives.from_first(truth, track.time_ns)
+    assert drives.errors(track.pose, true)[0].max() < 0.03 * 28.0 + 0.1
+    way = np.hypot(true[:, 0], true[:, 1])
+    middle = (way > 12.0) & (way < 16.0)
+    assert not track.usable[middle].any()
+    assert track.usable[way < 4.0].all()
+    assert any("do not tell the way" in loss.what for loss in losses)
+
+
+def test_scans_are_held_by_walls_that_run_two_ways_and_for_some_way_by_odometry():
+    pose = np.zeros((40, 3))
+    driven_m = np.arange(40.0)
+    corridor, corner = np.diag([1.0, 1e4, 1e4]), np.diag([1e4, 1e4, 1e4])
+    index = np.arange(1, 40)
+    pairs = np.stack([index, index - 1], axis=-1)
+    information = np.where((index < 10)[:, None, None], corner, corridor)
+    links = Links(pairs, np.zeros((39, 3)), information)
+    held = held_in_place(pose, links, driven_m, most_drift_m=0.2)
+    assert held[:16].all()
+    assert not held[17:].any()
