@@ -18,6 +18,7 @@ DIRECTIONS = 720
 """Directions from the base in which a point is kept."""
 INTERVAL_NS = 100_000_000
 """Time between surroundings: that between audio scans."""
+BLOCK = 512
 LASER_AGE_NS = 200_000_000
 """A laser scan farther away in time than this no longer shows the same surroundings."""
 
@@ -38,6 +39,7 @@ class SurroundingsGatherer:
         self._last: LaserScan | None = None
         self._time_ns: list[int] = []
         self._point_m: list[NDArray[np.float16]] = []
+        self._blocks: list[NDArray[np.float16]] = []
 
     def see(self, scan: LaserScan) -> None:
         """Look at one more scan; scans come by time."""
@@ -56,10 +58,17 @@ class SurroundingsGatherer:
             self._take(self._due.popleft())
         if self._last is not None and self._last.middle_ns > self._time_ns[-1]:
             self._take(self._last.middle_ns)
+        self._pack()
         return Surroundings(
             np.array(self._time_ns, dtype=np.int64),
-            np.array(self._point_m, dtype=np.float16).reshape(-1, DIRECTIONS, 2),
+            np.concatenate([np.empty((0, DIRECTIONS, 2), dtype=np.float16), *self._blocks]),
         )
+
+    def _pack(self) -> None:
+        """Many small arrays made one, which takes half of their memory."""
+        if self._point_m:
+            self._blocks.append(np.array(self._point_m, dtype=np.float16))
+            self._point_m.clear()
 
     def _take(self, time_ns: int) -> None:
         """Keep what is seen at a time in the scan of each scanner that is nearest to it."""
@@ -78,6 +87,8 @@ class SurroundingsGatherer:
         ]
         self._time_ns.append(time_ns)
         self._point_m.append(thinned(np.concatenate(points), DIRECTIONS).astype(np.float16))
+        if len(self._point_m) == BLOCK:
+            self._pack()
 
 
 def gathered_surroundings(lasers: Iterable[LaserScan], odometry: Trajectory) -> Surroundings:

@@ -79,7 +79,7 @@ def _repeat(source: Path, path: Path, seconds: float, compression: str) -> None:
             if channel.topic not in ids:
                 schema_id = writer.register_schema(schema.name, schema.encoding, schema.data)
                 ids[channel.topic] = writer.register_channel(
-                    channel.topic, channel.message_encoding, schema_id, channel.metadata
+                    channel.topic, channel.message_encoding, schema_id
                 )
         origin = np.zeros(3)
         for turn in range(int(np.ceil(seconds * 1e9 / period_ns))):
