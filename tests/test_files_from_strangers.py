@@ -17,7 +17,7 @@ from soundmap.outputs.new_folder import new_folder
 from soundmap.outputs.run_folder import write_run
 from soundmap.outputs.stored_run import read_power_map, read_report, read_run
 
-DEEP = "[" * 5000
+DEEP = "[" * 2000
 LAUGHS = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"{b}: &{b} [*{a}, *{a}, *{a}, *{a}, *{a}, *{a}, *{a}, *{a}, *{a}]\n"
     for a, b in zip("abcdefghij", "bcdefghijk", strict=True)
