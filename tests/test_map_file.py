@@ -122,3 +122,24 @@ class TestFaults:
     def test_map_without_walls(self, tmp_path):
         with pytest.raises(MapError, match="no cell of the map is occupied"):
             read_map(write_map(tmp_path, np.full((5, 5), 254)))
+
+
+def test_a_written_map_reads_as_map_server_does(tmp_path):
+    """Rows from the top, 8 bits; occupied above occupied_thresh, free below free_thresh."""
+    rng = np.random.default_rng(6)
+    kind = rng.integers(0, 3, (5, 7))
+    room = OccupancyGrid(GridFrame(0.05, (-1.25, 0.4), (5, 7)), kind == 0, kind == 1)
+    for name, content in map_files(room).items():
+        (tmp_path / name).write_bytes(content)
+    lines = (tmp_path / "map.yaml").read_text().splitlines()
+    said = dict(line.split(": ", 1) for line in lines if ": " in line)
+    magic, *words = (tmp_path / said["image"]).read_bytes().split(maxsplit=4)
+    width, height, most = (int(word) for word in words[:3])
+    assert (magic, width, height, most) == (b"P5", 7, 5, 255)
+    pixels = np.frombuffer((tmp_path / said["image"]).read_bytes()[-35:], dtype=np.uint8)
+    occupancy = (255.0 - pixels.reshape(5, 7)[::-1]) / 255.0
+    assert int(said["negate"]) == 0
+    assert float(said["resolution"]) == 0.05
+    assert [float(word) for word in said["origin"].strip("[]").split(",")] == [-1.25, 0.4, 0.0]
+    assert np.array_equal(occupancy > float(said["occupied_thresh"]), room.occupied)
+    assert np.array_equal(occupancy < float(said["free_thresh"]), room.free)
