@@ -24,7 +24,7 @@ def folder(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("samples")
     logs = (SAMPLES / "run1.mcap", SAMPLES / "run3.mcap")
     common = ("--map", SAMPLES / "map.yaml", "--out", folder, "--figures", "none")
-    soundmap("process", *logs, *common)
+    soundmap("process", *logs, *common, "--strict")  # nothing is wrong with them
     runs = (folder / "run1", folder / "run3")
     soundmap("diff", *runs, "--out", folder / "diff", "--figures", "none")
     return folder

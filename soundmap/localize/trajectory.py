@@ -38,6 +38,8 @@ RARE_NS = 600_000_000
 """Between laser scans farther apart than this, odometry carries the pose."""
 TORN_M, TORN_RAD = 0.5, np.radians(30.0)
 """A step that differs so much from that of the odometry tears the trajectory."""
+BRIDGE_M = 0.3
+"""A robot that is known before and after so short a way was not lost on it."""
 ROUNDS = 4
 """Times that all poses are smoothed and it is judged anew which of them to trust."""
 
@@ -153,7 +155,9 @@ def _smoothed(
         result = smoothed_poses(step, weight, pose, scans)
         pose = result.pose
         agreed = agreement(room, pose, views, tolerance_m=tolerance_m)
-        trusted = _without_scraps(_trusted(agreed, result, trusted, config), pose, step)
+        way_m = np.concatenate([[0.0], np.cumsum(np.hypot(step[:, 0], step[:, 1]))])
+        trusted = _trusted(agreed, result, trusted, way_m, config)
+        trusted = _without_scraps(trusted, pose, step, way_m)
         if round_ == 0:  # later poses follow the odometry and cannot judge it
             both = trusted[:-1] & trusted[1:]
             found = relative(pose[:-1], pose[1:])
@@ -174,18 +178,38 @@ def _not_too_sure(model: OdometryModel, config: LocalizeConfig) -> OdometryModel
 
 
 def _trusted(
-    agreed: Agreement, result: SmoothedPoses, before: NDArray[np.bool_], config: LocalizeConfig
+    agreed: Agreement,
+    result: SmoothedPoses,
+    before: NDArray[np.bool_],
+    way_m: FloatArray,
+    config: LocalizeConfig,
 ) -> NDArray[np.bool_]:
-    """Poses that are known well enough and whose scans match; new ones have to match better."""
+    """Poses that are known well enough and whose scans match; new ones have to match better.
+
+    Between two such poses with next to no way between them, scans need not match: what stands in
+    front of the map for a moment does not lose a robot.
+    """
     proved = (agreed.matched >= FIRST_MATCH) & (agreed.beyond <= MOST_BEYOND)
     variance = np.diagonal(result.covariance, axis1=1, axis2=2)
     near = np.sqrt(variance[:, 0] + variance[:, 1]) <= config.max_spread_m
     near &= np.sqrt(variance[:, 2]) <= config.max_spread_rad
-    return near & np.where(before, agreed.matched >= config.min_match, proved)
+    matching = near & np.where(before, agreed.matched >= config.min_match, proved)
+    return near & _bridged(matching, way_m)
+
+
+def _bridged(matching: NDArray[np.bool_], way_m: FloatArray) -> NDArray[np.bool_]:
+    """True, too, between two that are true with little way (K,) between them [m]."""
+    index = np.flatnonzero(matching)
+    following = np.searchsorted(index, np.arange(len(matching)))
+    inside = (following > 0) & (following < len(index))
+    bridged = matching.copy()
+    after, before = index[following[inside]], index[following[inside] - 1]
+    bridged[inside] |= way_m[after] - way_m[before] <= BRIDGE_M
+    return bridged
 
 
 def _without_scraps(
-    trusted: NDArray[np.bool_], pose: FloatArray, step: FloatArray
+    trusted: NDArray[np.bool_], pose: FloatArray, step: FloatArray, way_m: FloatArray
 ) -> NDArray[np.bool_]:
     """The trusted poses less short pieces that odometry joins to neither neighbour.
 
@@ -197,11 +221,13 @@ def _without_scraps(
     pose : ndarray, shape (K, 3)
     step : ndarray, shape (K - 1, 3)
         Motion from each pose to the next according to the odometry.
+    way_m : ndarray, shape (K,)
+        Driven until each pose [m].
     """
     index = np.flatnonzero(trusted)
     if len(index) < 2:
         return trusted
-    way_m = np.concatenate([[0.0], np.cumsum(np.hypot(step[:, 0], step[:, 1]))])[index]
+    way_m = way_m[index]
     by_odometry = chained(step)[index]
     found = relative(pose[index[:-1]], pose[index[1:]])
     off = found - relative(by_odometry[:-1], by_odometry[1:])
