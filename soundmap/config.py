@@ -242,7 +242,7 @@ class DetectConfig(Table):
     method: Literal["maxima", "sparse"] = "sparse"
     """"maxima": local maxima of the power map, as in the paper; "sparse": the few places whose
     sounds together explain all scans, with mirror images told from sources."""
-    false_alarm_rate: Annotated[float, Field(gt=0, lt=1)] = 0.02
+    false_alarm_rate: Annotated[float, Field(gt=0, lt=1)] = 0.03
     """Share of runs in which "sparse" may report anything that is no source."""
     min_visit_share: Share = 0.10
     """A cell counts with more than this share of the greatest number of visits."""
