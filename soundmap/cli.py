@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import signal
 import sys
@@ -24,6 +23,7 @@ from soundmap.terminal import (
     JsonOption,
     QuietOption,
     StartPoseOption,
+    hush_libraries,
     parsed_start_pose,
     print_result,
     resolved_config,
@@ -274,11 +274,6 @@ def main() -> None:
     signal.signal(signal.SIGTERM, _stop)
     hush_libraries()
     app(prog_name="soundmap")
-
-
-def hush_libraries() -> None:
-    """Keep the terminal free of what libraries have to say."""
-    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it tells of its font cache otherwise
 
 
 def _stop(number: int, _frame: object) -> None:

@@ -260,7 +260,7 @@ _own: list[_Process] = []
 
 
 def _begin(events: multiprocessing.Queue[Event], stopping: Stopping) -> None:
-    from soundmap.cli import hush_libraries
+    from soundmap.terminal import hush_libraries
 
     _own.append(_Process(events, stopping))
     for number in (signal.SIGINT, signal.SIGTERM):

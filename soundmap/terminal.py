@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import sys
 from collections.abc import Callable, Mapping
@@ -114,3 +115,8 @@ def parsed_start_pose(text: str | None) -> tuple[float, float, float] | None:
             param_hint="'--start-pose'",
         )
     return x, y, math.radians(degrees)
+
+
+def hush_libraries() -> None:
+    """Keep the terminal free of what libraries have to say."""
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it tells of its font cache otherwise

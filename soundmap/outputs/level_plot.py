@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from html import escape
 
 SHOWN_ROWS = 20
-WIDTH, ROW, LEFT, RIGHT = 560, 24, 46, 104
+WIDTH, ROW, LEFT, RIGHT = 600, 24, 46, 144
 STEPS_DB = (0.5, 1, 2, 5, 10, 20, 50)
 
 
