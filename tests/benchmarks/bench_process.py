@@ -45,7 +45,7 @@ def cost(log: Path, site: Path, *, with_map: bool) -> Cost:
     """Process a log and tell what it took."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "out"
-        command = [SOUNDMAP, "process", str(log), "--out", str(out), "--quiet"]
+        command = [SOUNDMAP, "process", str(log), "--out", str(out), "--no-cache", "--quiet"]
         command += ["--config", str(site / "robot.toml")]
         if with_map:
             command += ["--map", str(site / "map.yaml"), "--start-pose", START]
