@@ -110,6 +110,19 @@ def test_obstacles_that_the_map_lacks_do_not_pull_the_pose():
     assert np.quantile(position[estimate.usable], 0.95) < 0.08
 
 
+def test_people_who_stand_in_front_for_a_moment_do_not_lose_the_robot():
+    covered, ready = [], SCANS[0].time_ns + 4_000_000_000
+    for scan in SCANS:
+        if 0 <= scan.time_ns - ready < 400_000_000:
+            scan = replace(scan, range_m=np.minimum(scan.range_m, 0.4))
+        covered.append(scan)
+    estimate = estimate_trajectory(covered, odometry_of(TRUTH), ROOM, CONFIG)
+    moment = (estimate.time_ns >= ready) & (estimate.time_ns < ready + 400_000_000)
+    assert moment.any()
+    assert estimate.usable.all()
+    assert errors(estimate)[0][moment].max() < 0.05
+
+
 def test_the_same_input_gives_the_same_trajectory():
     short = SCANS[:120]
     first, second = (estimate_trajectory(short, odometry_of(TRUTH), ROOM, CONFIG) for _ in range(2))
