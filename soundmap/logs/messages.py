@@ -7,8 +7,6 @@ from typing import Any
 
 from soundmap.logs.schemas import MessageType
 
-Stamp = int
-
 
 class Kind(StrEnum):
     """What is measured or told; the names are those that a person reads."""

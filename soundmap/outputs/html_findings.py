@@ -43,7 +43,8 @@ def sources_table(report: Mapping[str, Any]) -> str:
     if fitted:
         note += (
             " 95 % within: half the axes of the ellipse that holds the place. By chance: "
-            "probability that a run without any source would show as much."
+            "probability that something else, such as the ghost of a louder source, would show "
+            "as much."
         )
     dots = [
         Dot(row["id"], row["power_db"], row.get("level_sigma_db"), level_text(row)) for row in rows
