@@ -41,17 +41,21 @@ def map_log(
     Writes a folder with the map (map_server's PGM and YAML), the trajectory in it, a picture and a
     report. The origin of the map is the first pose of the robot.
     """
-    from soundmap.outputs.map_folder import write_map_run
+    from soundmap.outputs.illustrator import illustrator
     from soundmap.outputs.new_folder import new_folder
     from soundmap.outputs.progress import chosen_progress
     from soundmap.outputs.summary import map_view
 
     settings = resolved_config(config)
-    with new_folder(out, force=force, inputs=[log]) as new:
+    with (
+        new_folder(out, force=force, inputs=[log]) as new,
+        illustrator(figures) as pictures,
+    ):
         from soundmap.map_log import mapped
+        from soundmap.outputs.map_folder import write_map_run
 
         run = mapped(log, settings, progress=chosen_progress(quiet=quiet or as_json))
-        report = write_map_run(run, new, figures=figures)
+        report = write_map_run(run, new, pictures)
     if not quiet or as_json:
         print_result({**report, "folder": str(out)}, map_view, as_json=as_json)
 
@@ -79,17 +83,21 @@ def localize_log(
 
     Writes a folder with the trajectory, the map, a picture of both and a report.
     """
-    from soundmap.outputs.map_folder import write_map_run
+    from soundmap.outputs.illustrator import illustrator
     from soundmap.outputs.new_folder import new_folder
     from soundmap.outputs.progress import chosen_progress
     from soundmap.outputs.summary import localization_view
 
     settings, start = resolved_config(config), parsed_start_pose(start_pose)
-    with new_folder(out, force=force, inputs=[log, map_file]) as new:
+    with (
+        new_folder(out, force=force, inputs=[log, map_file]) as new,
+        illustrator(figures) as pictures,
+    ):
         from soundmap.map_log import localized
+        from soundmap.outputs.map_folder import write_map_run
 
         progress = chosen_progress(quiet=quiet or as_json)
         run = localized(log, map_file, settings, start_pose=start, progress=progress)
-        report = write_map_run(run, new, figures=figures)
+        report = write_map_run(run, new, pictures)
     if not quiet or as_json:
         print_result({**report, "folder": str(out)}, localization_view, as_json=as_json)

@@ -47,28 +47,33 @@ def diff(
     Writes a folder with the difference of the two power maps in dB, what became of each source,
     and how sure that is.
     """
-    from soundmap.comparison import compared
+    from soundmap.outputs.illustrator import illustrator
     from soundmap.outputs.new_folder import folder_for_difference, new_folder
-    from soundmap.outputs.run_folder import write_diff
     from soundmap.outputs.summary import diff_view
 
     settings = resolved_config(config)
     folder = out if out is not None else folder_for_difference(run, background)
     compared_files = [run / "map.yaml", background / "map.yaml"]
-    with new_folder(folder, force=force, inputs=compared_files) as new:
+    with (
+        new_folder(folder, force=force, inputs=compared_files) as new,
+        illustrator(figures) as pictures,
+    ):
+        from soundmap.comparison import compared
+        from soundmap.outputs.run_folder import write_diff
+
         began = perf_counter()
         comparison = compared(run, background, settings.diff, settings.detect)
         timings_s = {"compare": perf_counter() - began}
         report = write_diff(
             comparison.ratio,
             new,
+            pictures,
             room=comparison.room,
             run=run,
             background=background,
             config=settings.diff,
             timings_s=timings_s,
             notes=comparison.notes,
-            figures=figures,
         )
     if not quiet or as_json:
         print_result({**report, "folder": str(folder)}, diff_view, as_json=as_json)

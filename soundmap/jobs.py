@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from soundmap.cores import CORE_LIMIT, usable_cores
 from soundmap.errors import SoundmapError
 from soundmap.outputs.picture_format import PictureFormat
 from soundmap.outputs.progress import Progress, Stage, chosen_progress
@@ -77,11 +78,16 @@ def processed(job: Job, progress: Progress) -> dict[str, Any]:
     SoundmapError
         It cannot be done; nothing is left behind.
     """
+    from soundmap.outputs.illustrator import illustrator
     from soundmap.outputs.new_folder import new_folder
-    from soundmap.outputs.run_folder import write_run
 
-    with new_folder(job.folder, force=job.force, inputs=[job.log]) as new:
+    with (
+        new_folder(job.folder, force=job.force, inputs=[job.log]) as new,
+        illustrator(job.figures) as pictures,
+    ):
         from soundmap.measured import MeasuredCache, cache_folder
+        from soundmap.outputs.pictures import place_pictures, sound_pictures
+        from soundmap.outputs.run_folder import write_run
         from soundmap.replay import process
 
         run = process(
@@ -90,13 +96,15 @@ def processed(job: Job, progress: Progress) -> dict[str, Any]:
             job.config,
             start_pose=job.start_pose,
             cache=MeasuredCache(cache_folder()) if job.use_cache else None,
+            heard=lambda *sound: pictures.begin(sound_pictures(job.log, *sound)),
             progress=progress,
         )
+        pictures.begin(place_pictures(run))
         if job.rerun:
             from soundmap.retelling import recorded
 
             run = recorded(run, new, progress=progress)
-        return write_run(run, new, figures=job.figures)
+        return write_run(run, new, pictures)
 
 
 def outcomes(jobs: Sequence[Job], *, at_a_time: int, quiet: bool) -> Iterator[tuple[int, Outcome]]:
@@ -193,17 +201,15 @@ def _deaf_to_interrupts() -> Iterator[None]:
 @contextmanager
 def _shared_threads(processes: int) -> Iterator[None]:
     """Lets each process that begins meanwhile use its share of the cores."""
-    name = "NUMBA_NUM_THREADS"
-    before = os.environ.get(name)
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    os.environ[name] = str(max((int(before) if before else cores or 1) // processes, 1))
+    before = os.environ.get(CORE_LIMIT)
+    os.environ[CORE_LIMIT] = str(max(usable_cores() // processes, 1))
     try:
         yield
     finally:
         if before is None:
-            del os.environ[name]
+            del os.environ[CORE_LIMIT]
         else:
-            os.environ[name] = before
+            os.environ[CORE_LIMIT] = before
 
 
 class _Board:

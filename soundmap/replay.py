@@ -49,6 +49,7 @@ def process(
     *,
     start_pose: tuple[float, float, float] | None = None,
     cache: MeasuredCache | None = None,
+    heard: Callable[[AudioScans, Trajectory], None] | None = None,
     progress: Progress,
 ) -> Run:
     """Sources, power map and trajectory of one log.
@@ -65,6 +66,8 @@ def process(
         x [m], y [m], heading [rad] in the given map; without it, it is found in the map.
     cache : MeasuredCache, optional
         Where the results of the slow stages are kept, and taken from if they are there.
+    heard : callable, optional
+        Is told the audio scans and the trajectory as soon as they are known for good.
     progress : Progress
 
     Raises
@@ -79,6 +82,8 @@ def process(
     losses = LossLedger()
     with clock.stage("calibrate"):
         scans, array, offsets = _calibrated(measured.scans, measured.array, trajectory, config)
+    if heard is not None:
+        heard(scans, trajectory)
     with clock.stage("fuse"):
         frame = power_map_frame(room, config.fuse.cell_m)
         accumulator = PowerAccumulator(frame, level_reference(array.pascal_per_count))

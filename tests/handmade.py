@@ -10,6 +10,8 @@ from soundmap.config import Config
 from soundmap.geometry import Trajectory
 from soundmap.grid import GridFrame, OccupancyGrid
 from soundmap.losses import Loss
+from soundmap.outputs.illustrator import Illustrator
+from soundmap.outputs.picture_format import PictureFormat
 from soundmap.run import Run
 from soundmap.sensors import ArrayOffsets, Offset, OffsetVerdict
 from soundmap.sound import (
@@ -23,6 +25,7 @@ from soundmap.sound import (
 )
 
 START_NS = 1_700_007_000_123_456_789
+NO_PICTURES = Illustrator(PictureFormat.NONE)
 FULL_SCALE = LevelReference.FULL_SCALE
 
 

@@ -22,6 +22,7 @@ import soundmap.replay
 from soundmap import __version__
 from soundmap.cli import app
 from soundmap.errors import LogError, NothingUsableError
+from soundmap.outputs.illustrator import Illustrator
 from soundmap.outputs.run_folder import write_run
 
 ENVIRONMENT = {**os.environ, "NO_COLOR": "1", "COLUMNS": "80"}
@@ -47,7 +48,7 @@ def processed(monkeypatch, tmp_path, _no_pictures) -> list[dict]:
     monkeypatch.chdir(tmp_path)
     calls: list[dict] = []
 
-    def process(log, map_path, config, *, start_pose, cache, progress):
+    def process(log, map_path, config, *, start_pose, cache, heard, progress):
         calls.append({"log": log, "map": map_path, "config": config, "start": start_pose})
         with progress.stage("localize", 20.0) as stage:
             stage.advance_to(3.0)
@@ -252,7 +253,7 @@ def two_runs(monkeypatch, tmp_path, _no_pictures) -> Path:
     monkeypatch.chdir(tmp_path)
     for name in ("run1", "run3"):
         (tmp_path / name).mkdir()
-        write_run(made_run(Path(f"{name}.mcap")), tmp_path / name)
+        write_run(made_run(Path(f"{name}.mcap")), tmp_path / name, Illustrator())
 
     def compared(run, background, diff, detect):
         ratio, room = made_ratio(), walled_room()
@@ -291,7 +292,7 @@ def test_two_runs_are_compared_by_the_real_thing(monkeypatch, tmp_path):
         run = made_run(Path(f"{name}.mcap"))
         power_map = replace(run.power_map, power_sum=run.power_map.power_sum * gain)
         (tmp_path / name).mkdir()
-        write_run(replace(run, power_map=power_map), tmp_path / name)
+        write_run(replace(run, power_map=power_map), tmp_path / name, Illustrator())
     result = invoked("diff", "run1", "run3", "--json")
     assert result.exit_code == 0, result.output
     rows = json.loads(result.stdout)["sources"]
@@ -447,7 +448,7 @@ def test_a_signal_stops_the_work_and_leaves_nothing_behind(tmp_path, number, cod
 def test_a_missing_log_is_unreadable_input(tmp_path):
     room = tmp_path / "room"
     room.mkdir()
-    write_run(made_run(), room)
+    write_run(made_run(), room, Illustrator())
     result = soundmap_process("process", "none.mcap", "--map", "room/map.yaml", cwd=tmp_path)
     assert result.returncode == 3
     assert result.stdout == ""

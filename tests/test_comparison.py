@@ -12,10 +12,9 @@ from soundmap.comparison import compared
 from soundmap.config import Config
 from soundmap.geometry import inverted, relative, transformed
 from soundmap.grid import GridFrame, OccupancyGrid
-from soundmap.outputs.picture_format import PictureFormat
 from soundmap.outputs.run_folder import write_run
 from soundmap.sound import Reflection, Source, SourceFit, SourceList
-from tests.handmade import made_run, walled_room
+from tests.handmade import NO_PICTURES, made_run, walled_room
 from tests.heard import drive, heard_scans
 
 CONFIG = Config()
@@ -55,7 +54,7 @@ def folder(
         sources=moved(SourceList(sources, scans.reference, images), frame_pose),
     )
     path.mkdir()
-    write_run(run, path, figures=PictureFormat.NONE)
+    write_run(run, path, NO_PICTURES)
     return path
 
 

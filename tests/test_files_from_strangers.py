@@ -13,6 +13,7 @@ from soundmap.config import loaded_config
 from soundmap.errors import ConfigError, LogError, MapError, OutputError
 from soundmap.logs.log_files import log_files
 from soundmap.map_file import read_map
+from soundmap.outputs.illustrator import Illustrator
 from soundmap.outputs.new_folder import new_folder
 from soundmap.outputs.run_folder import write_run
 from soundmap.outputs.stored_run import read_power_map, read_report, read_run
@@ -33,7 +34,7 @@ class Harm:
 def run_folder(tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
-    write_run(made_run(), folder)
+    write_run(made_run(), folder, Illustrator())
     return folder
 
 

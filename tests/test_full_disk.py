@@ -8,6 +8,7 @@ import pytest
 from handmade import made_run
 
 from soundmap.errors import OutputError
+from soundmap.outputs.illustrator import Illustrator
 from soundmap.outputs.new_folder import new_folder
 from soundmap.outputs.progress import chosen_progress
 from soundmap.outputs.run_folder import write_run
@@ -34,7 +35,7 @@ def sizes(folder):
 def test_a_disk_that_is_full_at_any_output_leaves_nothing_behind(tmp_path):
     run = made_run()
     with new_folder(tmp_path / "whole", force=False) as folder:
-        write_run(run, folder)
+        write_run(run, folder, Illustrator())
     written = sizes(tmp_path / "whole")
     assert len(written) > 8
     for size in written:
@@ -43,16 +44,16 @@ def test_a_disk_that_is_full_at_any_output_leaves_nothing_behind(tmp_path):
             pytest.raises(OutputError, match="cut: cannot be written"),
             new_folder(tmp_path / "cut", force=False) as folder,
         ):
-            write_run(run, folder)
+            write_run(run, folder, Illustrator())
         assert [path.name for path in tmp_path.iterdir()] == ["whole"]
     with files_no_larger_than(2 * written[-1]), new_folder(tmp_path / "cut", force=False) as folder:
-        write_run(run, folder)
+        write_run(run, folder, Illustrator())
     assert len(list((tmp_path / "cut").iterdir())) == len(list((tmp_path / "whole").iterdir()))
 
 
 def test_a_recording_that_does_not_fit_on_the_disk_is_an_error_and_leaves_the_run_alone(tmp_path):
     with new_folder(tmp_path / "run", force=False) as folder:
-        write_run(made_run(), folder)
+        write_run(made_run(), folder, Illustrator())
     before = sorted(path.name for path in (tmp_path / "run").iterdir())
     with files_no_larger_than(50_000), pytest.raises(OutputError, match="cannot be written"):
         recording_of(tmp_path / "run", progress=chosen_progress(quiet=True))

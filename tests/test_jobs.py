@@ -22,7 +22,7 @@ import soundmap.replay
 from handmade import made_run
 from soundmap.errors import LogError
 
-def process(log, map_path, config, *, start_pose, cache, progress):
+def process(log, map_path, config, *, start_pose, cache, heard, progress):
     if log.stem in ("slow", "slower"):
         (log.parent / f"working-{{os.getpid()}}").touch()
         time.sleep(60)

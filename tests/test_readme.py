@@ -85,9 +85,10 @@ def test_every_exit_code_is_explained():
 def test_every_file_of_a_run_folder_is_explained(tmp_path):
     from handmade import made_run
 
+    from soundmap.outputs.illustrator import Illustrator
     from soundmap.outputs.run_folder import write_run
 
-    write_run(made_run(), tmp_path)
+    write_run(made_run(), tmp_path, Illustrator())
     missing = [path.name for path in tmp_path.iterdir() if f"`{path.name}`" not in README]
     assert missing == []
 

@@ -5,14 +5,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rerun as rr
-from handmade import START_NS, made_ratio, made_run, walled_room
+from handmade import NO_PICTURES, START_NS, made_ratio, made_run, walled_room
 from rerun.chunk import RrdReader
 
 import soundmap.retelling
 from soundmap.config import DiffConfig
 from soundmap.errors import LogError
 from soundmap.geometry import Mount
-from soundmap.outputs.picture_format import PictureFormat
 from soundmap.outputs.progress import SilentProgress
 from soundmap.outputs.run_folder import write_diff, write_run
 from soundmap.retelling import recorded, recording_of, write_recording
@@ -139,7 +138,7 @@ def test_a_log_that_cannot_be_read_is_told(run, monkeypatch, tmp_path):
 def test_the_recording_of_a_folder_is_made_once(run, log, tmp_path):
     folder = tmp_path / "run1"
     folder.mkdir()
-    write_run(run, folder, figures=PictureFormat.NONE)
+    write_run(run, folder, NO_PICTURES)
     before = {path.name for path in folder.iterdir()}
     file, remark = recording_of(folder, progress=SilentProgress())
     assert (file, remark) == (folder / "run.rrd", None)
@@ -152,7 +151,7 @@ def test_the_recording_of_a_folder_is_made_once(run, log, tmp_path):
 def test_a_recording_that_fails_leaves_nothing(run, log, tmp_path):
     folder = tmp_path / "run1"
     folder.mkdir()
-    write_run(run, folder, figures=PictureFormat.NONE)
+    write_run(run, folder, NO_PICTURES)
     before = {path.name for path in folder.iterdir()}
 
     def broken():
@@ -168,12 +167,12 @@ def test_a_difference_has_a_recording_of_its_own(tmp_path):
     write_diff(
         made_ratio(),
         tmp_path,
+        NO_PICTURES,
         room=walled_room(),
         run=Path("run1"),
         background=Path("run3"),
         config=DiffConfig(),
         timings_s={},
-        figures=PictureFormat.NONE,
     )
     file, _ = recording_of(tmp_path, progress=SilentProgress())
     assert file.name == "diff.rrd"

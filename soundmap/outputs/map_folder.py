@@ -6,32 +6,27 @@ import dataclasses
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from soundmap.config import config_toml
 from soundmap.map_file import map_files
+from soundmap.outputs.illustrator import Illustrator
 from soundmap.outputs.new_folder import REPORT, writing
-from soundmap.outputs.picture_format import PictureFormat
-from soundmap.outputs.pictures import Pictures, write_pictures
+from soundmap.outputs.pictures import map_pictures
 from soundmap.outputs.report import json_text, provenance, trajectory_summary
 from soundmap.outputs.run_folder import trajectory_arrays, tum_text, write_arrays
 from soundmap.run import MapRun
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure  # slow to load: only where pictures are drawn
 
-
-def write_map_run(
-    run: MapRun, folder: Path, *, figures: PictureFormat = PictureFormat.PNG
-) -> dict[str, Any]:
+def write_map_run(run: MapRun, folder: Path, illustrator: Illustrator) -> dict[str, Any]:
     """Write map, trajectory, picture, report and settings into an empty folder.
 
     Parameters
     ----------
     run : MapRun
     folder : Path
-    figures : PictureFormat
-        How to draw the map, if at all.
+    illustrator : Illustrator
+        Who draws the map.
 
     Returns
     -------
@@ -45,7 +40,7 @@ def write_map_run(
         (folder / "trajectory.tum").write_text(tum_text(run.trajectory), encoding="ascii")
         write_arrays(folder / "trajectory.npz", trajectory_arrays(run.trajectory))
         (folder / "config.toml").write_text(config_toml(run.config), encoding="utf-8")
-        write_pictures(lambda: _pictures(run), folder, figures)
+        illustrator.write(map_pictures(run), folder)
         report = map_report(run, {**run.timings_s, "outputs": time.perf_counter() - start})
         (folder / REPORT).write_text(json_text(report) + "\n", encoding="utf-8")
     return report
@@ -83,13 +78,3 @@ def map_report(run: MapRun, timings_s: Mapping[str, float]) -> dict[str, Any]:
         "timings_s": dict(timings_s),
         "config": run.config.model_dump(mode="json", exclude_none=True),
     }
-
-
-def _pictures(run: MapRun) -> Pictures:
-    return {"map": lambda: _map_figure(run)}
-
-
-def _map_figure(run: MapRun) -> Figure:
-    from soundmap.outputs.figures import map_figure
-
-    return map_figure(run.room, run.trajectory, f"{run.log.stem}: geometric map and trajectory")

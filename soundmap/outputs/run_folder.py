@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +18,9 @@ from soundmap.grid import GridFrame, OccupancyGrid
 from soundmap.losses import Loss
 from soundmap.map_file import map_files
 from soundmap.outputs.html_report import report_html
+from soundmap.outputs.illustrator import Illustrator
 from soundmap.outputs.new_folder import REPORT, writing
-from soundmap.outputs.picture_format import PictureFormat
-from soundmap.outputs.pictures import difference_pictures, run_pictures, write_pictures
+from soundmap.outputs.pictures import difference_pictures, run_pictures
 from soundmap.outputs.report import (
     CHANGE_COLUMNS,
     REFLECTION_COLUMNS,
@@ -36,17 +35,15 @@ from soundmap.run import Run
 from soundmap.sound import AudioScans, PowerMap
 
 
-def write_run(
-    run: Run, folder: Path, *, figures: PictureFormat = PictureFormat.PNG
-) -> dict[str, Any]:
+def write_run(run: Run, folder: Path, illustrator: Illustrator) -> dict[str, Any]:
     """Write everything that a run yields into an empty folder.
 
     Parameters
     ----------
     run : Run
     folder : Path
-    figures : PictureFormat
-        How to write the pictures, if at all.
+    illustrator : Illustrator
+        Who draws the pictures, and may have begun to.
 
     Returns
     -------
@@ -64,7 +61,7 @@ def write_run(
         write_arrays(folder / "audio_scans.npz", _audio_scan_arrays(run.scans))
         _write_map(folder, run.room)
         (folder / "config.toml").write_text(config_toml(run.config), encoding="utf-8")
-        shown = write_pictures(partial(run_pictures, run), folder, figures)
+        shown = illustrator.write(run_pictures(run), folder)
         report = run_report(run, {**run.timings_s, "outputs": time.perf_counter() - start})
         images = csv_text(REFLECTION_COLUMNS, report["reflections"])
         (folder / "reflections.csv").write_text(images, encoding="utf-8")
@@ -75,6 +72,7 @@ def write_run(
 def write_diff(
     ratio: PowerRatio,
     folder: Path,
+    illustrator: Illustrator,
     *,
     room: OccupancyGrid | None,
     run: Path,
@@ -82,7 +80,6 @@ def write_diff(
     config: DiffConfig,
     timings_s: Mapping[str, float],
     notes: Sequence[Loss] = (),
-    figures: PictureFormat = PictureFormat.PNG,
 ) -> dict[str, Any]:
     """Write the difference of two runs into an empty folder.
 
@@ -99,8 +96,8 @@ def write_diff(
         Wall time of each stage so far [s].
     notes : sequence of Loss
         Why the two runs may not compare like with like.
-    figures : PictureFormat
-        How to write the picture, if at all.
+    illustrator : Illustrator
+        Who draws the picture.
 
     Returns
     -------
@@ -113,8 +110,7 @@ def write_diff(
         if room is not None:
             _write_map(folder, room)
         title = f"{run.resolve().name} against {background.resolve().name}"
-        pictures = partial(difference_pictures, ratio, room=room, title=title)
-        shown = write_pictures(pictures, folder, figures)
+        shown = illustrator.write(difference_pictures(ratio, room=room, title=title), folder)
         report = diff_report(
             ratio,
             run=run,

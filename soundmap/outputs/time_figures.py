@@ -20,7 +20,6 @@ from soundmap.outputs.figures import (
     written,
 )
 from soundmap.outputs.floor import DOTS_PER_INCH, shortened
-from soundmap.run import Run
 from soundmap.sound import AudioScans, decibels
 
 WIDTH, HEIGHT = 7.4, 5.2
@@ -28,9 +27,8 @@ WIDTH, HEIGHT = 7.4, 5.2
 AUDIO_COLUMNS = 1000
 
 
-def audio_scan_figure(run: Run) -> Figure:
+def audio_scan_figure(scans: AudioScans, trajectory: Trajectory, title: str) -> Figure:
     """Level on every bearing over time (Sect. 2.3), and below it the loudest and the mean."""
-    scans = run.scans
     figure = Figure(figsize=(WIDTH, HEIGHT), dpi=DOTS_PER_INCH)
     FigureCanvasAgg(figure)
     upper = figure.add_axes((0.13, 0.45, 0.71, 0.48))
@@ -38,7 +36,7 @@ def audio_scan_figure(run: Run) -> Figure:
     figure.text(
         0.48,
         0.985,
-        shortened(f"{run.log.stem}: audio scans", 75),
+        shortened(title, 75),
         ha="center",
         va="top",
         fontsize=11,
@@ -59,7 +57,7 @@ def audio_scan_figure(run: Run) -> Figure:
     total_s, power = _columns_in_time(scans)
     _draw_bearings(figure, upper, scans, total_s, power)
     _draw_levels(lower, total_s, power)
-    _shade(lower, unlocalized(run.trajectory, scans), "robot not localized")
+    _shade(lower, unlocalized(trajectory, scans), "robot not localized")
     lower.set_xlim(0.0, total_s)
     lower.grid(color="0.9", linewidth=0.6)
     handles, labels = lower.get_legend_handles_labels()

@@ -29,6 +29,7 @@ from soundmap.comparison import compared
 from soundmap.config import loaded_config
 from soundmap.errors import SoundmapError
 from soundmap.evaluate import read_places, read_tum
+from soundmap.outputs.illustrator import Illustrator
 from soundmap.outputs.picture_format import PictureFormat
 from soundmap.outputs.progress import SilentProgress
 from soundmap.outputs.run_folder import write_run
@@ -74,7 +75,7 @@ def run_folder(name: str, table: dict[str, Any], cache: Path) -> Path:
             progress=SilentProgress(),
         )
         folder.mkdir(exist_ok=True)
-        write_run(run, folder, figures=PictureFormat.NONE)
+        write_run(run, folder, Illustrator(PictureFormat.NONE))
         (made / "run.mcap").unlink()
     return folder
 

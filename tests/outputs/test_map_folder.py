@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from handmade import START_NS, round_trip, walled_room
+from handmade import NO_PICTURES, START_NS, round_trip, walled_room
 from PIL import Image
 from rich.console import Console
 
@@ -13,8 +13,8 @@ from soundmap.errors import OutputError
 from soundmap.losses import Loss
 from soundmap.map_file import read_map
 from soundmap.outputs.figures import map_figure
+from soundmap.outputs.illustrator import Illustrator
 from soundmap.outputs.map_folder import map_report, write_map_run
-from soundmap.outputs.picture_format import PictureFormat
 from soundmap.outputs.summary import map_view
 from soundmap.run import MapRun
 
@@ -51,7 +51,7 @@ def run(tmp_path):
 
 
 def test_the_map_written_is_read_back_as_it_was(run, tmp_path):
-    write_map_run(run, tmp_path, figures=PictureFormat.NONE)
+    write_map_run(run, tmp_path, NO_PICTURES)
     found = read_map(tmp_path / "map.yaml")
     np.testing.assert_array_equal(found.occupied, run.room.occupied)
     np.testing.assert_array_equal(found.free, run.room.free)
@@ -61,7 +61,7 @@ def test_the_map_written_is_read_back_as_it_was(run, tmp_path):
 def test_the_image_has_its_first_row_at_the_top_as_map_server_wants(run, tmp_path):
     corner = np.zeros(run.room.frame.shape, dtype=bool)
     corner[0, 0] = True  # lower left
-    write_map_run(replace(run, room=replace(run.room, occupied=corner)), tmp_path)
+    write_map_run(replace(run, room=replace(run.room, occupied=corner)), tmp_path, Illustrator())
     with Image.open(tmp_path / "map.pgm") as image:
         pixels = np.asarray(image)
     assert pixels[-1, 0] == 0
@@ -70,7 +70,7 @@ def test_the_image_has_its_first_row_at_the_top_as_map_server_wants(run, tmp_pat
 
 
 def test_every_file_is_there_and_the_settings_can_be_used_again(run, tmp_path):
-    report = write_map_run(run, tmp_path)
+    report = write_map_run(run, tmp_path, Illustrator())
     expected = {
         "map.pgm",
         "map.yaml",
@@ -108,7 +108,7 @@ def test_a_person_reads_what_the_odometry_was_worth(run):
 
 def test_a_folder_that_cannot_be_written_is_named(run, tmp_path):
     with pytest.raises(OutputError, match="nowhere"):
-        write_map_run(run, tmp_path / "nowhere", figures=PictureFormat.NONE)
+        write_map_run(run, tmp_path / "nowhere", NO_PICTURES)
 
 
 def test_the_picture_shows_map_and_way(run):

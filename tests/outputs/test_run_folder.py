@@ -12,6 +12,7 @@ from soundmap.config import Config, DiffConfig, loaded_config
 from soundmap.errors import LogError, OutputError
 from soundmap.geometry import Trajectory
 from soundmap.map_file import read_map
+from soundmap.outputs.illustrator import Illustrator
 from soundmap.outputs.run_folder import tum_text, write_diff, write_run
 from soundmap.outputs.stored_run import read_power_map
 
@@ -36,7 +37,7 @@ CONTENT = {
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("run1")
-    write_run(made_run(), folder)
+    write_run(made_run(), folder, Illustrator())
     return folder
 
 
@@ -124,12 +125,12 @@ def test_a_configuration_with_every_kind_of_value_reads_back(tmp_path):
             "scan": {"low_hz": 500.0},
         }
     )
-    write_run(made_run(config=config), tmp_path)
+    write_run(made_run(config=config), tmp_path, Illustrator())
     assert loaded_config([tmp_path / "config.toml"]) == config
 
 
 def test_the_report_file_is_what_the_function_returns(tmp_path):
-    report = write_run(made_run(), tmp_path)
+    report = write_run(made_run(), tmp_path, Illustrator())
     stored = json.loads((tmp_path / "report.json").read_text())
     assert stored["sources"] == report["sources"]
     assert stored["timings_s"]["outputs"] > 0.0
@@ -139,7 +140,7 @@ def test_the_report_file_is_what_the_function_returns(tmp_path):
 def test_equal_results_give_equal_bytes_whenever_they_are_written(folder, tmp_path, monkeypatch):
     later = time.time() + 40_000_000.0
     monkeypatch.setattr(time, "time", lambda: later)
-    write_run(made_run(), tmp_path)
+    write_run(made_run(), tmp_path, Illustrator())
     for name in CONTENT - {"report.json", "report.html"}:
         assert (tmp_path / name).read_bytes() == (folder / name).read_bytes(), name
     reports = [json.loads((place / "report.json").read_text()) for place in (tmp_path, folder)]
@@ -152,7 +153,7 @@ def test_equal_results_give_equal_bytes_whenever_they_are_written(folder, tmp_pa
 
 
 def test_a_run_that_heard_nothing_has_a_whole_folder_too(tmp_path):
-    report = write_run(unlucky_run(), tmp_path)
+    report = write_run(unlucky_run(), tmp_path, Illustrator())
     assert {path.name for path in tmp_path.iterdir()} == CONTENT
     assert report["sources"] == []
     assert np.isnan(np.load(tmp_path / "power_map.npz")["power"]).all()
@@ -164,7 +165,7 @@ def test_a_full_disk_is_an_output_error(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(OutputError, match=r"map\.pgm.*No space left on device"):
-        write_run(made_run(), tmp_path)
+        write_run(made_run(), tmp_path, Illustrator())
 
 
 def test_a_diff_folder_holds_every_file_and_its_ratio(tmp_path):
@@ -172,6 +173,7 @@ def test_a_diff_folder_holds_every_file_and_its_ratio(tmp_path):
     report = write_diff(
         ratio,
         tmp_path,
+        Illustrator(),
         room=made_run().room,
         run=Path("runs/run1"),
         background=Path("runs/run3"),
@@ -211,6 +213,7 @@ def test_a_diff_folder_without_a_map_has_none(tmp_path):
     write_diff(
         made_ratio(),
         tmp_path,
+        Illustrator(),
         room=None,
         run=Path("run1"),
         background=Path("run3"),

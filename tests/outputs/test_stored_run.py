@@ -4,19 +4,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from handmade import fitted_run, made_ratio, made_run, unlucky_run, walled_room
+from handmade import NO_PICTURES, fitted_run, made_ratio, made_run, unlucky_run, walled_room
 
 from soundmap.config import DiffConfig
 from soundmap.errors import LogError
 from soundmap.geometry import Mount
-from soundmap.outputs.picture_format import PictureFormat
 from soundmap.outputs.run_folder import write_diff, write_run
 from soundmap.outputs.stored_run import read_difference, read_report, read_run
 from soundmap.run import Run
 
 
 def written(run: Run, folder: Path) -> Path:
-    write_run(run, folder, figures=PictureFormat.NONE)
+    write_run(run, folder, NO_PICTURES)
     return folder
 
 
@@ -62,12 +61,12 @@ def test_a_difference_reads_back_as_it_was(tmp_path):
     write_diff(
         ratio,
         tmp_path,
+        NO_PICTURES,
         room=walled_room(),
         run=Path("run1"),
         background=Path("run3"),
         config=DiffConfig(),
         timings_s={},
-        figures=PictureFormat.NONE,
     )
     read = read_difference(tmp_path)
     np.testing.assert_array_equal(read.ratio.ratio_db, ratio.ratio_db)
@@ -84,12 +83,12 @@ def test_a_difference_of_an_earlier_soundmap_still_reads(tmp_path):
     write_diff(
         replace(made_ratio(), changes=made_ratio().changes[:2]),
         tmp_path,
+        NO_PICTURES,
         room=None,
         run=Path("run1"),
         background=Path("run3"),
         config=DiffConfig(),
         timings_s={},
-        figures=PictureFormat.NONE,
     )
     report = json.loads((tmp_path / "report.json").read_text())
     del report["changes"]
@@ -103,7 +102,7 @@ def test_a_difference_of_an_earlier_soundmap_still_reads(tmp_path):
 
 
 def test_settings_that_are_no_longer_known_do_not_keep_a_run_from_being_read(tmp_path):
-    write_run(made_run(), tmp_path, figures=PictureFormat.NONE)
+    write_run(made_run(), tmp_path, NO_PICTURES)
     file = tmp_path / "config.toml"
     text = file.read_text()
     file.write_text(text.replace("[scan]", "[once]\nkey = 1\n\n[scan]\nformer = true"))
@@ -112,7 +111,7 @@ def test_settings_that_are_no_longer_known_do_not_keep_a_run_from_being_read(tmp
 
 def test_what_a_fit_found_reads_back_as_it_was(tmp_path):
     run = fitted_run()
-    write_run(run, tmp_path, figures=PictureFormat.NONE)
+    write_run(run, tmp_path, NO_PICTURES)
     read = read_run(tmp_path).sources
     for found, made in zip(read, run.sources, strict=True):
         assert found.fit.flags == made.fit.flags
