@@ -11,19 +11,18 @@ from numpy.typing import NDArray
 from soundmap.carrying import carried_poses, odometry_times_between
 from soundmap.config import LocalizeConfig
 from soundmap.errors import MapError
-from soundmap.geometry import FloatArray, Trajectory, relative, wrapped_angle
+from soundmap.geometry import FloatArray, Trajectory, relative
 from soundmap.grid import OccupancyGrid
 from soundmap.localize.agreement import Agreement, agreement
 from soundmap.localize.placement import (
     CANNOT_TELL,
-    ELSEWHERE_WAY_M,
     FIRST_MATCH,
     MOST_BEYOND,
-    ODOMETRY_DRIFT,
     Placement,
 )
-from soundmap.localize.smoothing import SmoothedPoses, carried, chained, smoothed_poses
+from soundmap.localize.smoothing import SmoothedPoses, carried, smoothed_poses
 from soundmap.localize.tracking import Tracker
+from soundmap.localize.trust import bridged, without_scraps
 from soundmap.localize.views import STAGE, Views, chosen_views
 from soundmap.localize.wall_fit import WallFit
 from soundmap.losses import LossLedger
@@ -36,10 +35,6 @@ UNKNOWN_ODOMETRY = OdometryModel(
 """What is believed of the odometry before the run has shown how good it is: not much."""
 RARE_NS = 600_000_000
 """Between laser scans farther apart than this, odometry carries the pose."""
-TORN_M, TORN_RAD = 0.5, np.radians(30.0)
-"""A step that differs so much from that of the odometry tears the trajectory."""
-BRIDGE_M = 0.3
-"""A robot that is known before and after so short a way was not lost on it."""
 ROUNDS = 4
 """Times that all poses are smoothed and it is judged anew which of them to trust."""
 
@@ -157,7 +152,7 @@ def _smoothed(
         agreed = agreement(room, pose, views, tolerance_m=tolerance_m)
         way_m = np.concatenate([[0.0], np.cumsum(np.hypot(step[:, 0], step[:, 1]))])
         trusted = _trusted(agreed, result, trusted, way_m, config)
-        trusted = _without_scraps(trusted, pose, step, way_m)
+        trusted = without_scraps(trusted, pose, step, way_m)
         if round_ == 0:  # later poses follow the odometry and cannot judge it
             both = trusted[:-1] & trusted[1:]
             found = relative(pose[:-1], pose[1:])
@@ -184,62 +179,13 @@ def _trusted(
     way_m: FloatArray,
     config: LocalizeConfig,
 ) -> NDArray[np.bool_]:
-    """Poses that are known well enough and whose scans match; new ones have to match better.
-
-    Between two such poses with next to no way between them, scans need not match: what stands in
-    front of the map for a moment does not lose a robot.
-    """
+    """Poses that are known well enough and whose scans match; new ones have to match better."""
     proved = (agreed.matched >= FIRST_MATCH) & (agreed.beyond <= MOST_BEYOND)
     variance = np.diagonal(result.covariance, axis1=1, axis2=2)
     near = np.sqrt(variance[:, 0] + variance[:, 1]) <= config.max_spread_m
     near &= np.sqrt(variance[:, 2]) <= config.max_spread_rad
     matching = near & np.where(before, agreed.matched >= config.min_match, proved)
-    return near & _bridged(matching, way_m)
-
-
-def _bridged(matching: NDArray[np.bool_], way_m: FloatArray) -> NDArray[np.bool_]:
-    """True, too, between two that are true with little way (K,) between them [m]."""
-    index = np.flatnonzero(matching)
-    following = np.searchsorted(index, np.arange(len(matching)))
-    inside = (following > 0) & (following < len(index))
-    bridged = matching.copy()
-    after, before = index[following[inside]], index[following[inside] - 1]
-    bridged[inside] |= way_m[after] - way_m[before] <= BRIDGE_M
-    return bridged
-
-
-def _without_scraps(
-    trusted: NDArray[np.bool_], pose: FloatArray, step: FloatArray, way_m: FloatArray
-) -> NDArray[np.bool_]:
-    """The trusted poses less short pieces that odometry joins to neither neighbour.
-
-    A few views may fit some other place of the map by chance.
-
-    Parameters
-    ----------
-    trusted : ndarray of bool, shape (K,)
-    pose : ndarray, shape (K, 3)
-    step : ndarray, shape (K - 1, 3)
-        Motion from each pose to the next according to the odometry.
-    way_m : ndarray, shape (K,)
-        Driven until each pose [m].
-    """
-    index = np.flatnonzero(trusted)
-    if len(index) < 2:
-        return trusted
-    way_m = way_m[index]
-    by_odometry = chained(step)[index]
-    found = relative(pose[index[:-1]], pose[index[1:]])
-    off = found - relative(by_odometry[:-1], by_odometry[1:])
-    drift = ODOMETRY_DRIFT * np.diff(way_m)
-    torn = np.hypot(off[:, 0], off[:, 1]) > TORN_M + drift
-    torn |= np.abs(wrapped_angle(off[:, 2])) > TORN_RAD + drift
-    piece = np.concatenate([[0], np.cumsum(torn)])
-    length_m = np.array([np.ptp(way_m[piece == number]) for number in range(piece[-1] + 1)])
-    scraps = length_m < min(ELSEWHERE_WAY_M, length_m.max())
-    kept = trusted.copy()
-    kept[index[scraps[piece]]] = False
-    return kept
+    return near & bridged(matching, way_m)
 
 
 def _checked(
