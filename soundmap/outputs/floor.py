@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from soundmap.geometry import FloatArray
 from soundmap.grid import GridFrame, OccupancyGrid
 from soundmap.outputs.area import Area, coarsened, cropped
-from soundmap.outputs.labels import label_offsets
+from soundmap.outputs.labels import is_far, label_offsets
 from soundmap.outputs.wording import ellipse_95
 
 WALL, UNKNOWN, OPEN = 0.25, 0.90, 1.0
@@ -34,9 +34,13 @@ LEFT, RIGHT, TOP, BOTTOM = 0.75, 0.25, 0.40, 0.55
 """Room around the axes for what is written there [inches]."""
 BAR_GAP, BAR_WIDTH, BAR_TEXT = 0.12, 0.18, 0.75
 BAR_LABEL_INCHES = 3.9
-LEGEND_ROW, LEGEND_ENTRY = 0.26, 1.35
+LEGEND_ROW = 0.26
+LEGEND_HANDLE, LEGEND_LETTER = 0.6, 0.078
+"""Width of what stands before a label, gaps included, and of one of its letters [inches]."""
 LEAST_WIDTH_INCHES = 5.0
 CIRCLE_POINTS = 15.0
+LEADER = {"arrowstyle": "-", "linewidth": 0.9, "color": "black", "shrinkA": 0, "shrinkB": 7}
+"""The line from a label to a marker that is far off."""
 
 Places = Sequence[tuple[float, float]]
 
@@ -154,7 +158,7 @@ class FloorPlan:
     def draw_places(
         self, places_m: Places, marks: Sequence[Mark], fills: Sequence[Any] | None = None
     ) -> None:
-        """Markers named S1, S2, ... in the order given; crowded ones go without a name.
+        """Markers named S1, S2, ... in the order given; where many crowd, some go without a name.
 
         Parameters
         ----------
@@ -172,10 +176,10 @@ class FloorPlan:
         size = (self.area.width * self.scale * 72.0, self.area.height * self.scale * 72.0)
         offsets = label_offsets(points, names, size, marker=CIRCLE_POINTS)
         unnamed = " (some unnamed)" if any(offset is None for offset in offsets) else ""
-        for mark in dict.fromkeys(marks):
+        for number, mark in enumerate(dict.fromkeys(marks)):
             own = [index for index, its in enumerate(marks) if its == mark]
             filled = "none" if fills is None else [fills[index] for index in own]
-            self._mark([places_m[index] for index in own], mark, unnamed, filled)
+            self._mark([places_m[index] for index in own], mark, "" if number else unnamed, filled)
         for place, name, mark, offset in zip(places_m, names, marks, offsets, strict=True):
             if offset is not None:
                 text = self.axes.annotate(
@@ -189,6 +193,7 @@ class FloorPlan:
                     color=mark.colour,
                     fontsize=9,
                     zorder=6,
+                    arrowprops=LEADER if is_far(offset) else None,
                 )
                 text.set_path_effects(_halo())
 
@@ -233,7 +238,7 @@ class FloorPlan:
         below = self._bar is not None and not beside
         right = RIGHT + (BAR_GAP + BAR_WIDTH + BAR_TEXT if beside else 0.0)
         total_width = max(LEFT + width + right, LEAST_WIDTH_INCHES)
-        columns = max(1, min(len(labels), int((total_width - 0.2) / LEGEND_ENTRY)))
+        columns = _legend_columns(labels, total_width - 0.2)
         rows = -(-len(labels) // columns)
         bottom = BOTTOM + LEGEND_ROW * rows + (0.1 if rows else 0.0)
         bar_bottom = bottom - 0.05
@@ -268,6 +273,7 @@ class FloorPlan:
                 frameon=False,
                 fontsize=9,
                 borderaxespad=0.45,
+                labelspacing=1.0,
                 handletextpad=0.5,
                 columnspacing=1.2,
             )
@@ -309,6 +315,18 @@ def shortened(text: str, most: int) -> str:
         return text
     start = (most - 1) * 3 // 7
     return f"{text[:start]}…{text[len(text) - (most - 1 - start) :]}"
+
+
+def _legend_columns(labels: Sequence[str], width: float) -> int:
+    """The most columns that fit into a width [inches]; they are filled one after the other."""
+    entries = [LEGEND_HANDLE + LEGEND_LETTER * len(label) for label in labels]
+    for columns in range(len(labels), 1, -1):
+        long, more = divmod(len(labels), columns)
+        ends = np.cumsum([long + (number < more) for number in range(columns)])
+        widest = [max(part) for part in np.split(np.array(entries), ends[:-1])]
+        if sum(widest) <= width:
+            return columns
+    return 1
 
 
 def _halo() -> list[patheffects.AbstractPathEffect]:

@@ -1,6 +1,6 @@
 import numpy as np
 
-from soundmap.outputs.labels import LETTER_HEIGHT, LETTER_WIDTH, label_offsets
+from soundmap.outputs.labels import LETTER_HEIGHT, LETTER_WIDTH, is_far, label_offsets
 
 
 def boxes(points, names, offsets):
@@ -25,8 +25,8 @@ def test_labels_cover_neither_one_another_nor_other_markers_nor_the_edge():
 
 
 def test_the_loudest_are_labelled_where_there_is_no_room_for_all():
-    points = np.full((12, 2), 50.0)
-    names = [f"S{number}" for number in range(1, 13)]
+    points = np.full((20, 2), 50.0)
+    names = [f"S{number}" for number in range(1, 21)]
     offsets = label_offsets(points, names, (100.0, 100.0), marker=2.0)
     assert offsets[0] is not None
     assert offsets[-1] is None
@@ -38,3 +38,28 @@ def test_at_the_edge_a_label_goes_inwards():
     ((x, y),) = label_offsets(np.array([[199.0, 199.0]]), ["S1"], (200.0, 200.0), marker=10.0)
     assert x < 0
     assert y < 0
+
+
+def test_each_of_a_few_near_ones_has_its_label_if_need_be_far_off():
+    cross = np.array([[0.0, 0.0], [20.0, 0.0], [-20.0, 0.0], [0.0, 20.0], [0.0, -20.0]])
+    points = np.array([100.0, 100.0]) + cross
+    names = [f"S{number}*" for number in range(1, 6)]
+    offsets = label_offsets(points, names, (200.0, 200.0), marker=15.0)
+    placed = list(boxes(points, names, offsets))
+    assert len(placed) == 5
+    assert [is_far(offset) for offset in offsets] == [True, False, False, False, False]
+    for box in placed:
+        gap = points - np.clip(points, box[:2], box[2:])
+        assert np.hypot(*gap.T).min() >= 7.5
+
+
+def test_a_label_without_a_line_is_clearly_nearest_to_its_own_marker():
+    rng = np.random.default_rng(4)
+    points = rng.uniform(20.0, 180.0, (12, 2))
+    names = [f"S{number}" for number in range(1, 13)]
+    offsets = label_offsets(points, names, (200.0, 200.0), marker=15.0)
+    near = [index for index, offset in enumerate(offsets) if offset and not is_far(offset)]
+    assert len(near) > 5
+    for index in near:
+        distance = np.hypot(*(points - points[index] - offsets[index]).T)
+        assert np.argmin(distance) == index
