@@ -69,23 +69,19 @@ def deskewed_rays(
     Rays
         Rays without a return, and rays at times that ``track`` does not span, are left out.
     """
-    valid = np.flatnonzero(np.isfinite(scan.range_m))
-    if most is not None and len(valid) > most:
-        valid = valid[_evenly(len(valid), most)]
-    ends = scan.mount.base_points(scan.bearing_rad[valid], scan.range_m[valid])
-    known, origins, ends = _taken(
+    origins, ends = _deskewed(
+        scan.bearing_rad,
+        np.asarray(scan.range_m, dtype=np.float64),
+        scan.time_ns,
+        scan.ray_interval_ns,
+        scan.mount.rotation,
+        scan.mount.translation_m,
         track.time_ns,
         track.pose,
-        scan.ray_time_ns[valid],
         time_ns,
-        scan.mount.translation_m[:2],
-        ends,
+        len(scan.range_m) if most is None else most,
     )
-    return Rays(time_ns, origins[known], ends[known])
-
-
-def _evenly(count: int, most: int) -> NDArray[np.int64]:
-    return (np.arange(most) * count + count // 2) // most
+    return Rays(time_ns, origins, ends)
 
 
 @njit(cache=True, nogil=True)
@@ -108,30 +104,31 @@ def interpolated_pose(
 
 
 @njit(cache=True, nogil=True)
-def _taken(
-    time_ns: NDArray[np.int64],
-    pose: FloatArray,
-    ray_ns: NDArray[np.int64],
-    now_ns: int,
-    origin: FloatArray,
-    end: FloatArray,
-) -> tuple[NDArray[np.bool_], FloatArray, FloatArray]:
-    """Rays taken from the base frames of their own times to that of one time.
-
-    Returns which of them have a known time, where they started and where they ended, (B, 2).
-    """
-    known = np.zeros(len(end), dtype=np.bool_)
-    origins, ends = np.empty(end.shape), np.empty(end.shape)
+def _deskewed(  # type: ignore[no-untyped-def]
+    bearing, ranges, first_ns, interval_ns, rotation, translation, time_ns, pose, now_ns, most
+):
+    """Where the returns of a scan started and ended, (B, 2) each, in the base frame of one time."""
+    valid = np.flatnonzero(np.isfinite(ranges))
+    kept = min(len(valid), most)
+    origins, ends = np.empty((kept, 2)), np.empty((kept, 2))
     now_x, now_y, now_heading = interpolated_pose(time_ns, pose, now_ns)
     now_cos, now_sin = np.cos(now_heading), np.sin(now_heading)
-    for k in range(len(end)):
-        x, y, heading = interpolated_pose(time_ns, pose, ray_ns[k])
-        known[k] = np.isfinite(x) and np.isfinite(now_x)
+    known = 0
+    for i in range(kept):
+        ray = valid[(i * len(valid) + len(valid) // 2) // kept if len(valid) > most else i]
+        ray_ns = first_ns + np.int64(np.rint(ray * interval_ns))
+        x, y, heading = interpolated_pose(time_ns, pose, ray_ns)
+        if not (np.isfinite(x) and np.isfinite(now_x)):
+            continue
         dx, dy = x - now_x, y - now_y
         shift_x, shift_y = now_cos * dx + now_sin * dy, now_cos * dy - now_sin * dx
         cos, sin = np.cos(heading - now_heading), np.sin(heading - now_heading)
-        origins[k, 0] = shift_x + cos * origin[0] - sin * origin[1]
-        origins[k, 1] = shift_y + sin * origin[0] + cos * origin[1]
-        ends[k, 0] = shift_x + cos * end[k, 0] - sin * end[k, 1]
-        ends[k, 1] = shift_y + sin * end[k, 0] + cos * end[k, 1]
-    return known, origins, ends
+        own_x, own_y = ranges[ray] * np.cos(bearing[ray]), ranges[ray] * np.sin(bearing[ray])
+        end_x = rotation[0, 0] * own_x + rotation[0, 1] * own_y + translation[0]
+        end_y = rotation[1, 0] * own_x + rotation[1, 1] * own_y + translation[1]
+        origins[known, 0] = shift_x + cos * translation[0] - sin * translation[1]
+        origins[known, 1] = shift_y + sin * translation[0] + cos * translation[1]
+        ends[known, 0] = shift_x + cos * end_x - sin * end_y
+        ends[known, 1] = shift_y + sin * end_x + cos * end_y
+        known += 1
+    return origins[:known], ends[:known]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -84,7 +85,7 @@ class LaserScan:
         offset = np.arange(len(self.range_m)) * self.ray_interval_ns
         return self.time_ns + np.rint(offset).astype(np.int64)
 
-    @property
+    @cached_property
     def middle_ns(self) -> int:
         """Time of the middle of the sweep [ns since epoch]."""
         return self.time_ns + round(0.5 * self.ray_interval_ns * max(len(self.range_m) - 1, 0))

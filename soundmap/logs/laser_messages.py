@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba import njit
 
 from soundmap.geometry import FloatArray
 from soundmap.logs.messages import Form, frame_name, ros_stamp_ns, timestamp_ns
@@ -53,19 +54,34 @@ def valid_ranges(sweep: LaserSweep) -> FloatArray:
 
     No return is what a scanner reports as NaN, infinite, nought, or outside its own limits.
     """
-    low, high = _limits(sweep)
-    with np.errstate(invalid="ignore"):  # what a signalling NaN raises when it is widened
-        ranges = np.array(sweep.ranges, dtype=np.float64)
-        ranges[~((ranges > 0.0) & (ranges >= low) & (ranges < high))] = np.nan
+    ranges = np.empty(len(sweep.ranges))
+    _returns(np.asarray(sweep.ranges), *_limits(sweep), ranges)
     return ranges
 
 
-def has_return(sweep: LaserSweep) -> bool:
-    """Whether any of the ranges is valid."""
-    low, high = _limits(sweep)
-    with np.errstate(invalid="ignore"):
-        ranges = np.asarray(sweep.ranges)
-        return bool(np.any((ranges > 0.0) & (ranges >= low) & (ranges < high)))
+def longest_return(sweep: LaserSweep) -> float:
+    """Greatest of the valid ranges [m]; NaN if there is none."""
+    kept = np.empty(len(sweep.ranges))
+    return float(_returns(np.asarray(sweep.ranges), *_limits(sweep), kept))
+
+
+@njit(cache=True)
+def _returns(ranges, low, high, kept):  # type: ignore[no-untyped-def]
+    """Keeps what is a return, else NaN; the greatest of them, NaN if there is none.
+
+    Compiled because numpy would let other threads go first after every step, thousands of times
+    a minute.
+    """
+    longest = np.nan
+    for i in range(len(ranges)):
+        distance = ranges[i]
+        if distance > 0.0 and low <= distance < high:
+            kept[i] = distance
+            if not distance <= longest:
+                longest = distance
+        else:
+            kept[i] = np.nan
+    return longest
 
 
 def _limits(sweep: LaserSweep) -> tuple[float, float]:

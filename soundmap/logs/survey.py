@@ -20,7 +20,7 @@ from soundmap.logs.audio_messages import (
     AudioFormatError,
     info_encoding,
 )
-from soundmap.logs.laser_messages import SWEEP_READERS, LaserSweep, has_return, valid_ranges
+from soundmap.logs.laser_messages import SWEEP_READERS, LaserSweep, longest_return
 from soundmap.logs.messages import KINDS, Form, Kind, form_of
 from soundmap.logs.odometry import OdometryRecord
 from soundmap.logs.reader import McapLog
@@ -127,12 +127,13 @@ class LaserRecord:
             return
         if self.first is None:
             self.first, self.beams = sweep._replace(ranges=()), len(sweep.ranges)
-        if not has_return(sweep):
+        longest_m = longest_return(sweep)
+        if np.isnan(longest_m):
             self.empty_ns.append(log_time_ns)
         else:
             unlimited = not np.isfinite(sweep.range_max_m) or sweep.range_max_m <= 0.0
             if unlimited or not self.any_return:
-                self.longest_m = max(self.longest_m, float(np.nanmax(valid_ranges(sweep))))
+                self.longest_m = max(self.longest_m, longest_m)
             self.any_return = True
         self.frame_ids[sweep.frame_id] += 1
         self.stamp_ns.append(sweep.stamp_ns)
