@@ -12,8 +12,6 @@ a real matrix product. Beside it stands the sum as the paper writes it, which is
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -44,20 +42,21 @@ def steered_response_power(
         Of each group of bins [square of the spectrum's unit], >= 0. Divided by the frames summed,
         by :func:`~soundmap.scan.spectrum.hann_power` and by :math:`Q^2` it is :math:`J_n`.
     """
-    rows = len(table.cosine)
     steered = [
         (
-            table.cosine[:, start:stop].reshape(rows, -1)
-            @ spectra[:, 0, start:stop].reshape(len(spectra), -1).T,
-            table.sine[:, start:stop].reshape(rows, -1)
-            @ spectra[:, 1, start:stop].reshape(len(spectra), -1).T,
+            _product(group.cosine, spectra[:, 0, group.blocks]),
+            _product(group.sine, spectra[:, 1, group.blocks]),
         )
-        for start, stop in pairwise(table.group_blocks)
+        for group in table.groups
     ]
     even, odd = (np.stack(part).transpose(2, 0, 1) for part in zip(*steered, strict=True))
     power = np.concatenate([even + odd, even - odd], axis=2) if table.halved else even + odd
     # Where the array hears nothing, rounding may leave a little less than nothing.
     return np.maximum(power, np.float32(0.0))
+
+
+def _product(table: NDArray[np.float32], parts: NDArray[np.float32]) -> NDArray[np.float32]:
+    return table.reshape(len(table), -1) @ parts.reshape(len(parts), -1).T
 
 
 def whitened_spectra(spectra: NDArray[np.float32], table: SteeringTable) -> NDArray[np.float32]:
@@ -78,13 +77,13 @@ def whitened_spectra(spectra: NDArray[np.float32], table: SteeringTable) -> NDAr
         As `steered_response_power` takes them.
     table : SteeringTable
     """
-    frequency = table.block_bin[:, None] + np.arange(LANES)
-    share = table.cosine[0, :, 0] * frequency**2
+    square = (table.block_bin[:, None] + np.arange(LANES)) ** 2.0
     own = spectra[:, 0, :, 0]
     least = SILENT * own.mean(axis=(1, 2), keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore"):
-        weight = np.where(own > 0.0, frequency**2 / np.maximum(own, least), 0.0)
-    return (spectra * (weight / share.sum())[:, None, :, None]).astype(np.float32)
+        loudness = np.where(own > 0.0, square / np.maximum(own, least), 0.0)
+    weight = (loudness / np.sum(table.weight * square)).astype(np.float32)
+    return np.asarray(spectra * weight[:, None, :, None])
 
 
 def steered_response_power_direct(

@@ -165,11 +165,27 @@ def _joined(
 
 
 @dataclass(frozen=True)
-class SteeringTable:
-    """Weighted cosines and sines of the phase that each baseline has on each bearing.
+class GroupTable:
+    """Weighted cosines and sines of the phase that each baseline has on each bearing, for a group.
 
-    The bins of a band are cut into blocks of `LANES`; the last of each group is filled up with
-    bins of no weight.
+    Attributes
+    ----------
+    blocks : slice
+        Of the band's blocks of bins those that hold bins of the group.
+    cosine, sine : ndarray of float32, shape (N or N / 2, M, B, LANES)
+        For each of these M blocks the weight, for pairs of different microphones twice the weight,
+        times cos and sin; nought for bins of other groups. With an even N only the first half of
+        the bearings: the opposite bearing has the same cosine and the opposite sine.
+    """
+
+    blocks: slice
+    cosine: NDArray[np.float32]
+    sine: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class SteeringTable:
+    """What it takes to steer the bins of a band, cut into blocks of `LANES`.
 
     Attributes
     ----------
@@ -178,25 +194,23 @@ class SteeringTable:
     baselines : Baselines
     block_bin : ndarray of int, shape (M,)
         Lowest bin of each block.
-    group_blocks : tuple of int, length G + 1
-        The first block of each group of bins, and their number.
-    cosine, sine : ndarray of float32, shape (N or N / 2, M, B, LANES)
-        The weight, for pairs of different microphones twice the weight, times cos and sin. With an
-        even N only the first half of the bearings: the opposite bearing has the same cosine and
-        the opposite sine.
+    weight : ndarray, shape (M, LANES)
+        What the square of each bin counts for; nought behind the band's last.
+    groups : tuple of GroupTable
+        One for each group of bins. A block may hold bins of several: cross-spectra cost more than
+        to steer some of them twice.
     """
 
     bearing_rad: FloatArray
     baselines: Baselines
     block_bin: NDArray[np.intp]
-    group_blocks: tuple[int, ...]
-    cosine: NDArray[np.float32]
-    sine: NDArray[np.float32]
+    weight: FloatArray
+    groups: tuple[GroupTable, ...]
 
     @property
     def halved(self) -> bool:
         """Whether the tables hold only the first half of the bearings."""
-        return len(self.cosine) < len(self.bearing_rad)
+        return len(self.groups[0].cosine) < len(self.bearing_rad)
 
     @property
     def spectra_shape(self) -> tuple[int, int, int, int]:
@@ -232,36 +246,39 @@ def steering_table(
         Where to split the band into groups of bins (sub-bands) whose power is told apart: the
         index, rising and inside (0, K), of the bin with which each group but the first begins.
     """
+    bins = len(weight)
+    edges = [0, *splits, bins]
+    if not all(start < stop for start, stop in pairwise(edges)):
+        raise ValueError(f"splits {list(splits)} do not rise inside the {bins} bins of the band")
     wavenumber = 2.0 * np.pi * frequency_hz / speed_of_sound_m_s
     tolerance_m = PHASE_TOLERANCE_RAD / float(wavenumber.max())
     baselines = distinct_baselines(positions_m, tolerance_m=tolerance_m)
     bearing = scan_bearings(bearings)
     kept = bearing if bearings % 2 else bearing[: bearings // 2]
-    block, group_blocks = _blocks(len(weight), splits)
+    block = np.arange(0, bins, LANES, dtype=np.intp)
     lane = block[:, None] + np.arange(LANES)
-    ends = np.append(block[1:], len(weight))
-    inside = lane < ends[:, None]
-    lane = np.minimum(lane, len(weight) - 1)
+    blocked_weight = np.where(lane < bins, weight[np.minimum(lane, bins - 1)], 0.0)
+    blocked_wavenumber = wavenumber[np.minimum(lane, bins - 1)]
+    groups = []
+    for start, stop in pairwise(edges):
+        blocks = slice(start // LANES, (stop - 1) // LANES + 1)
+        own = (lane[blocks] >= start) & (lane[blocks] < stop)
+        part = np.where(own, blocked_weight[blocks], 0.0)
+        tables = _phase_tables(part, blocked_wavenumber[blocks], baselines, direction(kept))
+        groups.append(GroupTable(blocks, *tables))
+    return SteeringTable(bearing, baselines, first_bin + block, blocked_weight, tuple(groups))
+
+
+def _phase_tables(
+    weight: FloatArray, wavenumber: FloatArray, baselines: Baselines, toward: FloatArray
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Weight (M, LANES) times cosine and sine of each baseline's phase on each bearing (R, 2)."""
     counts = np.where(np.arange(len(baselines)) == 0, 1.0, 2.0)
-    factor = np.where(inside, weight[lane], 0.0)[:, None, :] * counts[:, None]
-    cosine = np.empty((len(kept), *factor.shape), dtype=np.float32)
+    factor = weight[:, None, :] * counts[:, None]
+    cosine = np.empty((len(toward), *factor.shape), dtype=np.float32)
     sine = np.empty_like(cosine)
-    for row, toward in enumerate(direction(kept)):  # one bearing at a time: tables can be large
-        phase = wavenumber[lane][:, None, :] * (baselines.vector_m @ toward)[:, None]
+    for row, unit in enumerate(toward):  # one bearing at a time: tables can be large
+        phase = wavenumber[:, None, :] * (baselines.vector_m @ unit)[:, None]
         cosine[row] = factor * np.cos(phase)
         sine[row] = factor * np.sin(phase)
-    return SteeringTable(bearing, baselines, first_bin + block, group_blocks, cosine, sine)
-
-
-def _blocks(bins: int, splits: Sequence[int]) -> tuple[NDArray[np.intp], tuple[int, ...]]:
-    """Index of the lowest bin of each block, and the first block of each group, all counted."""
-    blocks: list[int] = []
-    group_blocks = [0]
-    for start, stop in pairwise([0, *splits, bins]):
-        if not start < stop:
-            raise ValueError(
-                f"splits {list(splits)} do not rise inside the {bins} bins of the band"
-            )
-        blocks += range(start, stop, LANES)
-        group_blocks.append(len(blocks))
-    return np.array(blocks, dtype=np.intp), tuple(group_blocks)
+    return cosine, sine

@@ -233,7 +233,7 @@ def limit_s(scans: int) -> float:
     transforms = 2.5 * length * np.log2(length) * q * frames
     window = 10.0 * len(band) * q * frames
     products = 8.0 * len(band) * len(table.baselines.first) * frames
-    steering = 4.0 * table.cosine.size
+    steering = 4.0 * table.groups[0].cosine.size
     a, b = np.ones((2, 1024, 1024), dtype=np.float32)
     speed = 2.0 * 1024**3 / cpu_seconds(lambda: a @ b, 5)[0]
     return float(scans * (transforms + window + products + steering) / speed)

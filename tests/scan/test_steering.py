@@ -97,7 +97,8 @@ def test_opposite_bearings_share_a_row(bearings, rows):
         weight=np.array([1.0, 2.0]),
         speed_of_sound_m_s=343.0,
     )
-    assert table.cosine.shape == table.sine.shape == (rows, 1, 1 + 9, LANES)
+    (group,) = table.groups
+    assert group.cosine.shape == group.sine.shape == (rows, 1, 1 + 9, LANES)
     assert table.halved is (bearings % 2 == 0)
     assert np.allclose(table.bearing_rad, scan_bearings(bearings))
     assert scan_bearings(bearings)[0] == 0.0
