@@ -20,6 +20,7 @@ from soundmap.calibrate.way import Way, array_way, moved_apart
 from soundmap.config import CalibrateConfig, ScanConfig
 from soundmap.geometry import FloatArray, Trajectory
 from soundmap.sensors import ArrayOffsets, MicArray, Offset, OffsetVerdict
+from soundmap.side_by_side import side_by_side
 
 LEAST_SCANS = 40
 STRETCH_M, STRETCH_SCANS, MOST_STRETCHES = 15.0, 400, 20
@@ -103,17 +104,19 @@ def _fits(peaks: Peaks, way_at: WayAt, ends: NDArray[np.int64]) -> list[BearingF
     """A rigid fit from each of the most promising starts; stretches end before these scans."""
     way = way_at(0.0)
     limits = np.searchsorted(peaks.scan, ends).tolist()
-    ballots = [ballot(way, peaks, first, last) for first, last in pairwise(ends.tolist())]
-    fits = []
-    for clock_s, yaw_rad in starting_points(ballots):
+    spans = list(pairwise(ends.tolist()))
+    ballots = side_by_side(lambda span: ballot(way, peaks, *span), spans)
+
+    def fit_from(start: tuple[float, float]) -> BearingFit | None:
         stretches = [
-            Stretch(first, last, fixed_places(votes, clock_s, yaw_rad))
+            Stretch(first, last, fixed_places(votes, *start))
             for (first, last), votes in zip(pairwise(limits), ballots, strict=True)
         ]
         stretches = [s for s in stretches if len(s.place_m) and s.last > s.first]
-        if stretches:
-            fits.append(rigid_fit(peaks, way_at, stretches, (clock_s, yaw_rad)))
-    return fits
+        return rigid_fit(peaks, way_at, stretches, start) if stretches else None
+
+    fits = side_by_side(fit_from, starting_points(ballots))
+    return [fit for fit in fits if fit is not None]
 
 
 def _stretches(way: Way) -> list[tuple[int, int]]:

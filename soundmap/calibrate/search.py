@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from soundmap.calibrate.peaks import Peaks
 from soundmap.calibrate.way import Way
 from soundmap.geometry import FloatArray, wrapped_angle
+from soundmap.side_by_side import side_by_side
 
 CLOCKS_S = 0.04 * np.arange(-2, 3)
 YAWS_RAD = np.radians(3.0) * np.arange(-3, 4)
@@ -91,9 +92,10 @@ def ballot(way: Way, peaks: Peaks, first: int, last: int) -> Ballot:
 
 def starting_points(ballots: list[Ballot]) -> list[tuple[float, float]]:
     """Clock [s] and yaw [rad] to begin from, the most promising first; not beside each other."""
+    grid = [(float(clock), float(yaw)) for clock in CLOCKS_S for yaw in YAWS_RAD]
     score = np.array(
-        [[sum(_pile(b, clock, yaw) for b in ballots) for yaw in YAWS_RAD] for clock in CLOCKS_S]
-    )
+        side_by_side(lambda at: sum(_pile(votes, *at) for votes in ballots), grid)
+    ).reshape(len(CLOCKS_S), -1)
     chosen: list[tuple[int, int]] = []
     for flat in np.argsort(-score, axis=None, kind="stable"):
         i, j = divmod(int(flat), len(YAWS_RAD))

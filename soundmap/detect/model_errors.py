@@ -23,6 +23,7 @@ from soundmap.detect.evidence import Evidence
 from soundmap.detect.harmonics import Single
 from soundmap.detect.sound_paths import Path, Paths, waves_heard
 from soundmap.geometry import FloatArray
+from soundmap.side_by_side import side_by_side
 
 STRENGTH_ERROR = 0.35
 """Standard deviation of a source's strength in one scan, over its mean strength."""
@@ -62,22 +63,33 @@ class Precision:
             np.empty((len(evidence), stop - start, stop - start), dtype=np.float32)
             for start, stop in pairwise(starts)
         ]
-        for first in range(0, len(evidence), SCANS_AT_ONCE):
-            scans = slice(first, min(first + SCANS_AT_ONCE, len(evidence)))
+
+        def invert(scans: slice) -> None:
             modes = [mode for each in components for mode in _modes(evidence, each, scans)]
             for band, inverse in enumerate(self.inverse):
                 own = slice(starts[band], starts[band + 1])
                 inverse[scans] = _inverse([mode[:, own] for mode in modes], inverse.shape[1])
 
+        side_by_side(invert, _parts(len(evidence)))
+
     def times(self, columns: Single) -> Single:
         r""":math:`\Sigma^{-1}` times columns (..., S, D)."""
         out = np.empty_like(columns)
         flat, result = columns.reshape(-1, *columns.shape[-2:]), out.reshape(-1, *out.shape[-2:])
-        for band, inverse in enumerate(self.inverse):
-            own = slice(self.starts[band], self.starts[band + 1])
-            part = np.ascontiguousarray(flat[:, :, own].transpose(1, 2, 0))
-            result[:, :, own] = np.matmul(inverse, part).transpose(2, 0, 1)
+
+        def multiply(scans: slice) -> None:
+            for band, inverse in enumerate(self.inverse):
+                own = slice(self.starts[band], self.starts[band + 1])
+                part = np.ascontiguousarray(flat[:, scans, own].transpose(1, 2, 0))
+                result[:, scans, own] = np.matmul(inverse[scans], part).transpose(2, 0, 1)
+
+        side_by_side(multiply, _parts(columns.shape[-2]))
         return out
+
+
+def _parts(scans: int) -> list[slice]:
+    """Scans that are worked on at once."""
+    return [slice(i, min(i + SCANS_AT_ONCE, scans)) for i in range(0, scans, SCANS_AT_ONCE)]
 
 
 def _inverse(modes: list[Single], size: int) -> Single:

@@ -7,11 +7,12 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from soundmap.geometry import FloatArray, Mount, Trajectory, relative, wrapped_angle
+from soundmap.side_by_side import side_by_side
 from soundmap.surroundings import Surroundings
 
 AGE_NS = 200_000_000
 """Surroundings farther away in time than this are no longer the same."""
-CHUNK = 1024
+CHUNK = 256
 """Times that are worked out at once; bounds the memory of long runs."""
 AROUND = 360
 """Directions in which :func:`ranges_around` tells ranges."""
@@ -54,7 +55,8 @@ def surface_ranges(
     bearing = np.broadcast_to(np.asarray(bearing_rad, dtype=np.float64), ranges.shape)
     centre, axes = mount.translation_m[:2].copy(), mount.rotation[:2, :2].copy()
     place = surroundings.nearest(time_ns, within_ns=AGE_NS)
-    for start in range(0, len(time_ns), CHUNK):
+
+    def fill(start: int) -> None:
         row = start + np.flatnonzero(place[start : start + CHUNK] >= 0)
         then = trajectory.at(surroundings.time_ns[place[row]])
         motion = relative(trajectory.at(time_ns[row]), then)
@@ -62,6 +64,8 @@ def surface_ranges(
         row, motion = row[fixed], motion[fixed]
         points = surroundings.point_m[place[row]].astype(np.float32)
         _surface_ranges(points, motion, centre, axes, bearing, tolerance_rad, row, ranges)
+
+    side_by_side(fill, range(0, len(time_ns), CHUNK))
     return ranges
 
 
