@@ -157,6 +157,9 @@ class LocalizeConfig(Table):
     smoothing: bool = True
     """Move all poses to where odometry and laser scans of the whole run fit best; without it the
     trajectory is the particle filter's, as in the paper."""
+    refine_mounts: Literal["off", "report", "correct"] = "off"
+    """With a map and smoothing: find how far the laser scanners sit from where the log says, by
+    scans and odometry, and tell it ("report") or use it as well ("correct")."""
     max_spread_m: Positive = 0.20
     """The sound map is updated only while the particles stand within this spread [m] ..."""
     max_spread_rad: Positive = math.radians(5.0)

@@ -37,6 +37,12 @@ class OdometryModel:
     noise_turn_per_metre: float = 0.05
     noise_turn_per_turn: float = 0.10
 
+    def __str__(self) -> str:
+        return (
+            f"distance x {self.distance_scale:.3f}, turn x {self.turn_scale:.3f}, "
+            f"{np.degrees(self.turn_per_metre):+.2f} degrees a metre"
+        )
+
     def corrected(self, step: FloatArray) -> FloatArray:
         """Steps as driven, from steps as reported, shapes (..., 3)."""
         length = np.hypot(step[..., 0], step[..., 1])

@@ -14,6 +14,7 @@ from soundmap.errors import MapError
 from soundmap.geometry import FloatArray, Trajectory, relative
 from soundmap.grid import OccupancyGrid
 from soundmap.localize.agreement import Agreement, agreement
+from soundmap.localize.mounts import MountOffset, added, mount_offsets, remounted
 from soundmap.localize.placement import (
     CANNOT_TELL,
     FIRST_MATCH,
@@ -35,6 +36,8 @@ UNKNOWN_ODOMETRY = OdometryModel(
 """What is believed of the odometry before the run has shown how good it is: not much."""
 RARE_NS = 600_000_000
 """Between laser scans farther apart than this, odometry carries the pose."""
+MOUNT_ROUNDS = 4
+"""Times that the mounts are found again from poses that fit them better."""
 ROUNDS = 4
 """Times that all poses are smoothed and it is judged anew which of them to trust."""
 
@@ -99,6 +102,9 @@ def localized(
     if estimate.usable.any():
         if config.smoothing:
             estimate = _smoothed(estimate, views, room, config)
+            if config.refine_mounts != "off" and estimate.usable.any():
+                refined = _with_refined_mounts(estimate, views, room, config, losses)
+                estimate = refined if config.refine_mounts == "correct" else estimate
         else:
             estimate = _filtered(estimate, views, room, config)
     return _joined(_checked(estimate, views, room, losses), odometry)
@@ -158,6 +164,39 @@ def _smoothed(
             found = relative(pose[:-1], pose[1:])
             model = _not_too_sure(fitted_odometry(reported[both], found[both], model), config)
     return Estimate(pose, trusted, agreed.matched, agreed.beyond, result.covariance)
+
+
+def _with_refined_mounts(
+    estimate: Estimate,
+    views: Views,
+    room: OccupancyGrid,
+    config: LocalizeConfig,
+    losses: LossLedger,
+) -> Estimate:
+    """The estimate with the scanners where scans and odometry put them, which is told."""
+    offsets: list[MountOffset] = []
+    walls = WallFit(room, config)
+    for _ in range(MOUNT_ROUNDS):
+        agreed = agreement(room, estimate.pose, views, tolerance_m=3.0 * config.hit_sigma_m)
+        counts = agreed.is_matched & np.repeat(estimate.usable, np.diff(views.first))
+        scans = walls.evidence(views, counts, estimate.pose, by_lines=True)
+        found, pose = mount_offsets(views, estimate.pose, estimate.usable, scans)
+        offsets, views = added(offsets, found), remounted(views, found)
+        estimate = _smoothed(replace(estimate, pose=pose), views, room, config)
+    both = estimate.usable[:-1] & estimate.usable[1:]
+    wheels = fitted_odometry(
+        relative(views.odometry[:-1], views.odometry[1:])[both],
+        relative(estimate.pose[:-1], estimate.pose[1:])[both],
+        UNKNOWN_ODOMETRY,
+    )
+    losses.remark(f"odometry seems to need {wheels}", STAGE, effect="corrected")
+    for each in offsets:
+        losses.remark(
+            str(each),
+            STAGE,
+            effect="mount corrected" if config.refine_mounts == "correct" else "told only",
+        )
+    return estimate
 
 
 def _not_too_sure(model: OdometryModel, config: LocalizeConfig) -> OdometryModel:
