@@ -7,7 +7,6 @@ from collections.abc import Iterable
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from soundmap.deskew import deskewed_rays
 from soundmap.geometry import FloatArray, Trajectory
@@ -18,7 +17,6 @@ DIRECTIONS = 720
 """Directions from the base in which a point is kept."""
 INTERVAL_NS = 100_000_000
 """Time between surroundings: that between audio scans."""
-BLOCK = 512
 LASER_AGE_NS = 200_000_000
 """A laser scan farther away in time than this no longer shows the same surroundings."""
 
@@ -38,8 +36,7 @@ class SurroundingsGatherer:
         self._due: deque[int] = deque()
         self._last: LaserScan | None = None
         self._time_ns: list[int] = []
-        self._point_m: list[NDArray[np.float16]] = []
-        self._blocks: list[NDArray[np.float16]] = []
+        self._point_m = bytearray()  # of half-precision numbers; it grows in place
 
     def see(self, scan: LaserScan) -> None:
         """Look at one more scan; scans come by time."""
@@ -58,17 +55,8 @@ class SurroundingsGatherer:
             self._take(self._due.popleft())
         if self._last is not None and self._last.middle_ns > self._time_ns[-1]:
             self._take(self._last.middle_ns)
-        self._pack()
-        return Surroundings(
-            np.array(self._time_ns, dtype=np.int64),
-            np.concatenate([np.empty((0, DIRECTIONS, 2), dtype=np.float16), *self._blocks]),
-        )
-
-    def _pack(self) -> None:
-        """Many small arrays made one, which takes half of their memory."""
-        if self._point_m:
-            self._blocks.append(np.array(self._point_m, dtype=np.float16))
-            self._point_m.clear()
+        points = np.frombuffer(self._point_m, dtype=np.float16).reshape(-1, DIRECTIONS, 2)
+        return Surroundings(np.array(self._time_ns, dtype=np.int64), points)
 
     def _take(self, time_ns: int) -> None:
         """Keep what is seen at a time in the scan of each scanner that is nearest to it."""
@@ -86,9 +74,7 @@ class SurroundingsGatherer:
             for scanner in sorted(nearest)
         ]
         self._time_ns.append(time_ns)
-        self._point_m.append(thinned(np.concatenate(points), DIRECTIONS).astype(np.float16))
-        if len(self._point_m) == BLOCK:
-            self._pack()
+        self._point_m += thinned(np.concatenate(points), DIRECTIONS).astype(np.float16).data
 
 
 def gathered_surroundings(lasers: Iterable[LaserScan], odometry: Trajectory) -> Surroundings:

@@ -170,6 +170,8 @@ class ViewChooser:
     def views(self) -> Views:
         """What was chosen; among it the first and the last scan of every scanner.
 
+        To be called once: nothing is kept here afterwards.
+
         Raises
         ------
         NothingUsableError
@@ -185,6 +187,7 @@ class ViewChooser:
             for scan in self._passed_over.values()
         ]
         chosen = sorted([*self._chosen, *last], key=lambda view: view.time_ns)
+        self._chosen.clear()
         time_ns = np.array([view.time_ns for view in chosen], dtype=np.int64)
         driven_m = self._odometry.driven_m()
         return Views(

@@ -224,6 +224,7 @@ def open_log(path: Path, config: Config, *, need_audio: bool = True) -> RobotLog
         health = array_health(audio, whole.positions_m, losses)
         array, channels = without_faulty(whole, health, name)
     count_silences(filter(None, [odometry, *lasers, audio]), losses)
+    survey.forget_messages()
     return RobotLog(
         path=path,
         fingerprint=log.fingerprint(),

@@ -258,6 +258,18 @@ class Survey:
             effect="the well-known definition of that name is used",
         )
 
+    def forget_messages(self) -> None:
+        """Let go of what was kept of single messages; what there is of topics stays.
+
+        For when it is settled how to read them.
+        """
+        for topic in self.topics.values():
+            if isinstance(topic.record, AudioRecord):
+                topic.record = AudioRecord(topic.form, judged_ns=topic.record.judged_ns)
+            elif topic.record is not None:
+                topic.record = None
+        self.transforms = TransformRecord()
+
     def of_kind(self, kind: Kind) -> list[Topic]:
         """Topics of a kind, in alphabetical order."""
         return sorted((t for t in self.topics.values() if t.kind is kind), key=lambda t: t.name)

@@ -113,28 +113,30 @@ def kept_scans(
     The sub-bands are kept where all scans tell those that are asked for, and so is sharp power.
     """
     time_ns: list[int] = []
-    power: list[NDArray[np.float32]] = []
-    sub_bands: list[NDArray[np.float32]] = []
-    sharp: list[NDArray[np.float32]] = []
+    power, sub_bands, sharp = bytearray(), bytearray(), bytearray()  # they grow in place
     bearing_rad = np.empty(0)
     for scan in scans:
         time_ns.append(scan.time_ns)
-        power.append(scan.power.astype(np.float32))
+        power += scan.power.astype(np.float32).data
         bearing_rad = scan.bearing_rad
         if scan.sub_bands is not None and len(scan.sub_bands) == len(sub_band_hz) - 1:
-            sub_bands.append(scan.sub_bands.astype(np.float32, copy=False))
+            sub_bands += np.ascontiguousarray(scan.sub_bands, dtype=np.float32).data
         if scan.sharp is not None:
-            sharp.append(scan.sharp)
-    told = len(sub_bands) == len(time_ns) > 0
+            sharp += np.ascontiguousarray(scan.sharp, dtype=np.float32).data
+    size = len(bearing_rad)
+    bands = max(len(sub_band_hz) - 1, 0)
+    told = len(sub_bands) == len(time_ns) * bands * size * 4 > 0
     return AudioScans(
         np.array(time_ns, dtype=np.int64),
         bearing_rad,
-        np.array(power, dtype=np.float32).reshape(len(power), len(bearing_rad)),
+        np.frombuffer(power, dtype=np.float32).reshape(len(time_ns), size),
         reference,
         mount,
-        np.array(sub_bands) if told else None,
+        np.frombuffer(sub_bands, dtype=np.float32).reshape(-1, bands, size) if told else None,
         sub_band_hz if told else (),
-        np.array(sharp) if len(sharp) == len(time_ns) > 0 else None,
+        np.frombuffer(sharp, dtype=np.float32).reshape(-1, size)
+        if len(sharp) == len(power) > 0
+        else None,
     )
 
 
