@@ -28,6 +28,9 @@ MOST_LOOKS = (16, 8, 4, 2)
 """... of these numbers the greatest that leaves no more than that many, if any does. They are not
 merged: the fit knows how single scans scatter, not how their means do."""
 GOLDEN_SHARE = 0.6180339887498949
+LOUDNESS_SCANS = 7
+"""The noise of a scan goes by the mean power of so many scans around it: going by its own, scans
+that chance or interference makes loud would count less, and all levels would come out low."""
 SCANS_AT_ONCE = 4000
 MOST_TURN_RAD = np.radians(12.0)
 
@@ -115,6 +118,8 @@ def gathered_evidence(
     array : MicArray
     config : ScanConfig
     """
+    from scipy.ndimage import uniform_filter1d
+
     parts, edges_hz = scans.sub_bands, scans.sub_band_hz
     if parts is None:
         parts, edges_hz = scans.power[:, None], (config.low_hz, config.high_hz)
@@ -153,7 +158,8 @@ def gathered_evidence(
         np.add.at(heard, group[block], table.harmonics(parts[chosen[block]]))
     heard /= count[:, None]
     weight = np.sqrt(np.minimum(count, LARGEST_WEIGHT))[:, None]
-    weight = weight / (RELATIVE_NOISE * _means(mean, group, count))
+    loudness = uniform_filter1d(_means(mean, group, count), LOUDNESS_SCANS, axis=0, mode="nearest")
+    weight = weight / (RELATIVE_NOISE * loudness)
     return Evidence(
         _means(place, group, count),
         axis[first] + _means(wrapped_angle(axis - axis[first][group]), group, count),

@@ -6,7 +6,8 @@ Along each path the array hears a wave from some bearing, of some aperture, and
 
 of the mean square that the source has at 1 m, d being the way over the floor plan and h the height
 between the array and the source or its image. Mirror images by walls exist where the lasers see the
-wall at the point of reflection.
+wall at the point of reflection. Floor and ceiling mirror the source and each of those images, too:
+on the same bearing, so that one wave stands for all of such a family.
 """
 
 from __future__ import annotations
@@ -33,6 +34,10 @@ ON_MIRROR_M, ON_MIRROR_PER_M = 0.2, 0.03
 """A wall reflects where the lasers see a surface within this of it [m] [m/m]."""
 LEAST_FLOOR_M = 0.5
 """Height between the array and images below the floor, if its own height is not known."""
+CEILING_M = 4.2
+"""Height between the array and images above the ceiling."""
+FLOOR_SHARE, CEILING_SHARE = 0.5, 0.35
+"""Parts of a wave's power that its images by floor and ceiling have."""
 
 
 class Kind(IntEnum):
@@ -121,6 +126,22 @@ def _wave(dx: float, dy: float, axis: float, hand: float, waves: int) -> float:
 
 
 @njit(cache=True, nogil=True)
+def _arriving(way: float, up: float) -> tuple[float, float]:
+    """Gain of a wave, and cosine of its elevation."""
+    square = way * way + up * up
+    return 1.0 / square, way / np.sqrt(square)
+
+
+@njit(cache=True, nogil=True)
+def _joined(
+    gain: float, aperture: float, share: float, other: float, its_aperture: float
+) -> tuple[float, float]:
+    """Two waves of the same bearing as one, a share of the second's gain beside the first's."""
+    total = gain + share * other
+    return total, (gain * aperture + share * other * its_aperture) / total
+
+
+@njit(cache=True, nogil=True)
 def _paths(
     place: FloatArray,
     height: float,
@@ -150,11 +171,13 @@ def _paths(
         for path, up in ((0 if heard else 2, height), (1, floor)):
             if (path != 0 and behind) or (path == 1 and not heard):
                 continue
-            square = near * near + up * up
-            aperture[path, s] = near / np.sqrt(square)
-            gain[path, s] = 1.0 / square
+            gain[path, s], aperture[path, s] = _arriving(near, up)
         if behind:
             continue
+        if heard:  # the share of the floor, and beside it the ceiling's
+            gain[1, s], aperture[1, s] = _joined(
+                gain[1, s], aperture[1, s], CEILING_SHARE / FLOOR_SHARE, *_arriving(near, CEILING_M)
+            )
         for w in range(len(walls)):
             own = place[0] * walls[w, 0] + place[1] * walls[w, 1] - walls[w, 2]
             side = stand[s, 0] * walls[w, 0] + stand[s, 1] * walls[w, 1] - walls[w, 2]
@@ -169,10 +192,10 @@ def _paths(
             mirror = side / (side + own) * far
             surface = ranges[s, int(at + 0.5) % waves]
             if abs(surface - mirror) < ON_MIRROR_M + ON_MIRROR_PER_M * mirror:
-                square = far * far + height * height
-                wave[3 + w, s] = at
-                aperture[3 + w, s] = far / np.sqrt(square)
-                gain[3 + w, s] = 1.0 / square
+                total, tilt = _arriving(far, height)
+                total, tilt = _joined(total, tilt, FLOOR_SHARE, *_arriving(far, floor))
+                total, tilt = _joined(total, tilt, CEILING_SHARE, *_arriving(far, CEILING_M))
+                wave[3 + w, s], gain[3 + w, s], aperture[3 + w, s] = at, total, tilt
     return wave, aperture, gain, beyond
 
 

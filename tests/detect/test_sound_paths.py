@@ -4,7 +4,15 @@ from plane_waves import circle, mic_array
 
 from soundmap.detect.evidence import Evidence
 from soundmap.detect.harmonics import beam_table
-from soundmap.detect.sound_paths import Kind, Path, sound_paths, waves_heard
+from soundmap.detect.sound_paths import (
+    CEILING_M,
+    CEILING_SHARE,
+    FLOOR_SHARE,
+    Kind,
+    Path,
+    sound_paths,
+    waves_heard,
+)
 
 WAVES = 360
 WALL = np.array([[1.0, 0.0, 3.0]])
@@ -39,8 +47,14 @@ def test_a_source_is_heard_directly_and_by_its_images(axis):
     paths = sound_paths(evidence(axis=axis), WALL, np.array([2.0, 1.0]), 0.5, Kind.SOURCE)
     assert paths.gain[Path.DIRECT, 0] == pytest.approx(1.0 / (5.0 + 0.25))
     assert paths.aperture[Path.DIRECT, 0] == pytest.approx(np.sqrt(5.0 / 5.25))
-    assert paths.gain[Path.FLOOR, 0] == pytest.approx(1.0 / (5.0 + 1.2**2))
-    assert paths.gain[Path.WALLS, 0] == pytest.approx(1.0 / (4.0**2 + 1.0 + 0.25))
+    floor, ceiling = 1.0 / (5.0 + 1.2**2), 1.0 / (5.0 + CEILING_M**2)
+    assert paths.gain[Path.FLOOR, 0] == pytest.approx(floor + CEILING_SHARE / FLOOR_SHARE * ceiling)
+    below, above = 1.0 / (17.0 + 1.2**2), 1.0 / (17.0 + CEILING_M**2)
+    assert paths.gain[Path.WALLS, 0] == pytest.approx(
+        1.0 / (17.0 + 0.25) + FLOOR_SHARE * below + CEILING_SHARE * above
+    )
+    flat = np.sqrt(17.0 / (17.0 + CEILING_M**2))
+    assert flat < paths.aperture[Path.WALLS, 0] < 1.0
     toward = np.radians(paths.wave[Path.WALLS, 0]) + axis
     assert np.arctan2(np.sin(toward), np.cos(toward)) == pytest.approx(np.arctan2(1.0, 4.0))
     assert paths.gain[Path.HIDDEN, 0] == 0.0
