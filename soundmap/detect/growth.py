@@ -25,7 +25,7 @@ LEAST_SHARE = 0.35
 """Candidates of one round explain at least this share of what the best near them does."""
 APART_M = 2.0
 AT_ONCE = 4
-MOST_ROUNDS, MOST_COMPONENTS = 14, 16
+MOST_ROUNDS, MOST_COMPONENTS = 18, 24
 ONE_SOURCE_M = 0.75
 """Components nearer to each other than this may be one source."""
 BESIDE_M = 0.3
@@ -36,6 +36,8 @@ HEIGHTS_TRIED_M = (0.1, 0.3, 0.6, 1.0, 1.4)
 MERGE_SHARE = 0.4
 """They are, if one in their midst loses less than this share of what the lesser of both gains."""
 STEPS = 4
+GROWTH_SCANS = 120
+"""About as many scans tell where components are; all of them place and weigh these."""
 
 
 def grown_fit(evidence: Evidence, walls: FloatArray, candidates: Candidates) -> SparseFit:
@@ -47,6 +49,28 @@ def grown_fit(evidence: Evidence, walls: FloatArray, candidates: Candidates) -> 
     walls : ndarray, shape (W, 3)
     candidates : Candidates
     """
+    stride = max(round(len(evidence) / GROWTH_SCANS), 1)
+    few = evidence if stride == 1 else evidence.chosen(np.arange(0, len(evidence), stride))
+    fit = _grown(few, walls, candidates, LEAST_GAIN / stride)
+    if stride > 1:
+        fit = _with_all_scans(fit, evidence)
+    _merge(fit)
+    fit.renew()
+    _bring_into_view(fit)
+    for _ in range(STEPS):
+        fit.move()
+    for component in fit.components:
+        fit.choose_height(component, HEIGHTS_TRIED_M)
+    fit.refit()
+    fit.move()
+    fit.renew()
+    return fit
+
+
+def _grown(
+    evidence: Evidence, walls: FloatArray, candidates: Candidates, least_gain: float
+) -> SparseFit:
+    """Components added until no candidate explains as much as the least gain."""
     fit = SparseFit(evidence, walls)
     for _ in range(MOST_ROUNDS):
         matched = matched_scans(evidence, fit.residual, fit.precision)
@@ -54,7 +78,7 @@ def grown_fit(evidence: Evidence, walls: FloatArray, candidates: Candidates) -> 
             evidence,
             matched,
             candidates,
-            least=LEAST_GAIN,
+            least=least_gain,
             least_share=LEAST_SHARE,
             apart_m=APART_M,
             most=AT_ONCE,
@@ -70,16 +94,18 @@ def grown_fit(evidence: Evidence, walls: FloatArray, candidates: Candidates) -> 
         fit.move()
         if len(fit.components) >= MOST_COMPONENTS:
             break
-    _merge(fit)
+    return fit
+
+
+def _with_all_scans(grown: SparseFit, evidence: Evidence) -> SparseFit:
+    """The fit of some scans' components to all scans."""
+    fit = SparseFit(evidence, grown.walls)
+    for component in grown.components:
+        joined = fit.add(component.place_m, component.height_m, component.kind)
+        joined.strength = component.strength
+        joined.shares.update(component.shares)
     fit.renew()
-    _bring_into_view(fit)
-    for _ in range(STEPS):
-        fit.move()
-    for component in fit.components:
-        fit.choose_height(component, HEIGHTS_TRIED_M)
-    fit.refit()
     fit.move()
-    fit.renew()
     return fit
 
 
