@@ -1,8 +1,7 @@
 r"""From all audio scans of a run to its sources and their mirror images, by a sparse fit.
 
-A component of the fit counts as a source if it explains more than the model's own imperfection
-would: what a loud source leaves unexplained may look like a weak one. The probability of that is
-told by `soundmap.detect.significance`.
+What a loud source leaves unexplained may look like a weak one. A component of the fit counts as a
+source if such ghosts hardly ever look as much like one: `soundmap.detect.significance`.
 
 It assumes sources that stand still and sound most of the time, and surfaces that the lasers see.
 It fails where a source moves, where two stand within half a metre of each other, and where a weak
@@ -26,9 +25,10 @@ from soundmap.detect.matched_filter import effective_number
 from soundmap.detect.placement import Placement, placement, surface_odds
 from soundmap.detect.reflections import told_reflections
 from soundmap.detect.regions import Region, regions
-from soundmap.detect.significance import false_alarm_probabilities
+from soundmap.detect.significance import Marks, false_alarm_probabilities
 from soundmap.detect.sound_paths import Kind, Path
 from soundmap.detect.sparse_fit import Component, SparseFit
+from soundmap.detect.steadiness import steadiness
 from soundmap.detect.walls import surface_points, wall_lines
 from soundmap.geometry import FloatArray, Trajectory
 from soundmap.grid import OccupancyGrid
@@ -36,10 +36,10 @@ from soundmap.sensors import MicArray
 from soundmap.sound import AudioScans, Source, SourceFit, SourceList
 
 LEAST_SCANS = 8
+LEAST_NOISE = 0.5
+"""What is explained counts in units of what is left, but of no less than this of the noise."""
 ONE_SOURCE_M = 0.55
 """Components nearer to each other than this are one source."""
-FARTHEST_BEHIND_M = 0.32
-"""What lies farther behind the surfaces in front of it, on average, is no source."""
 STRETCH_M = 0.5
 ONE_SIDE_RAD = np.radians(40.0)
 SILENT, UNSTEADY_SHARE = 0.3, 0.35
@@ -54,6 +54,7 @@ class _Told:
     component: Component
     gain: float
     placement: Placement
+    probability: float
 
 
 def fitted_sources(
@@ -109,41 +110,46 @@ def _found(
     fit = grown_fit(evidence, wall_lines(surface), candidates)
     if not fit.components:
         return [], []
-    told = _told(fit, surface, surface_odds(surface, room))
-    gains = np.array([each.gain for each in told])
-    on_surface = np.array([each.placement.on_surface for each in told])
-    probability = {
-        each.index: float(value)
-        for each, value in zip(told, false_alarm_probabilities(gains, on_surface), strict=True)
-    }
+    stretch = _stretches(evidence)
+    told = _told(fit, stretch, surface, surface_odds(surface, room))
     sources = [
-        _source(fit, each, probability[each.index])
+        _source(fit, each, stretch)
         for each in _strongest_apart(told)
-        if probability[each.index] <= rate
-        and _heard_in_view(each.component)
+        if each.probability <= rate
+        and effective_number(each.component.paths.gain[Path.DIRECT]) >= LEAST_SCANS
         and region.owns(each.placement.place_m)
     ]
     images = [
         each.component
         for each in told
         if each.component.kind == Kind.IMAGE
-        and probability[each.index] <= rate
+        and each.probability <= rate
         and region.owns(each.component.place_m)
     ]
     return sources, images
 
 
-def _told(fit: SparseFit, surface_m: FloatArray, odds: FloatArray) -> list[_Told]:
+def _told(
+    fit: SparseFit, stretch: NDArray[np.int64], surface_m: FloatArray, odds: FloatArray
+) -> list[_Told]:
     """All components with what speaks for them, those that explain most first."""
+    components = fit.components
+    places = [
+        placement(component.place_m, covariance, surface_m, odds)
+        for component, covariance in zip(components, fit.covariances(), strict=True)
+    ]
+    noise = max(fit.noise, LEAST_NOISE)
+    marks = Marks(
+        gain=np.array([fit.gain(index) / noise for index in range(len(components))]),
+        steadiness=steadiness(fit, stretch),
+        area_m2=np.sqrt([np.linalg.det(place.covariance_m2) for place in places]),
+        behind_m=np.array([_behind_m(component) for component in components]),
+        on_surface=np.array([place.on_surface for place in places]),
+    )
     told = [
-        _Told(
-            index,
-            component,
-            fit.gain(index) / max(fit.noise, 0.5),
-            placement(component.place_m, covariance, surface_m, odds),
-        )
-        for index, (component, covariance) in enumerate(
-            zip(fit.components, fit.covariances(), strict=True)
+        _Told(index, component, float(gain), place, float(probability))
+        for index, (component, gain, place, probability) in enumerate(
+            zip(components, marks.gain, places, false_alarm_probabilities(marks), strict=True)
         )
     ]
     return sorted(told, key=lambda each: -each.gain)
@@ -161,20 +167,18 @@ def _strongest_apart(told: Sequence[_Told]) -> list[_Told]:
     return kept
 
 
-def _heard_in_view(component: Component) -> bool:
-    """Whether enough scans hear a source directly, and it does not lie behind what they see."""
+def _behind_m(component: Component) -> float:
+    """How far a source lies behind the surfaces that scans see in front of it, on average [m]."""
     gain, beyond = component.paths.gain[Path.DIRECT], component.paths.beyond_m
-    if effective_number(gain) < LEAST_SCANS:
-        return False
     known = np.isfinite(beyond) & (gain > 0.0)
-    if not known.any():
-        return True
-    return float(np.average(beyond[known], weights=gain[known] ** 2)) <= FARTHEST_BEHIND_M
+    if component.kind == Kind.IMAGE or not known.any():
+        return 0.0
+    return max(float(np.average(beyond[known], weights=gain[known] ** 2)), 0.0)
 
 
-def _source(fit: SparseFit, told: _Told, probability: float) -> Source:
+def _source(fit: SparseFit, told: _Told, stretch: NDArray[np.int64]) -> Source:
     component, place = told.component, told.placement.place_m
-    strength, told_of = fit.strengths_along(told.index, _stretches(fit.evidence))
+    strength, told_of = fit.strengths_along(told.index, stretch)
     power = float(component.strength.sum())
     heard = component.paths.gain[Path.DIRECT] > 0.0
     arc = _arc(fit.evidence.place_m[heard], place)
@@ -188,7 +192,7 @@ def _source(fit: SparseFit, told: _Told, probability: float) -> Source:
     details = SourceFit(
         power,
         told.placement.covariance_m2,
-        probability,
+        told.probability,
         arc,
         tuple(flags),
     )

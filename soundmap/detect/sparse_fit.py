@@ -87,6 +87,8 @@ class SparseFit:
     components : list of Component
     residual : ndarray of float32, shape (S, D)
     precision : Precision
+    gram : ndarray, shape (B, K, K)
+        Products of the components' columns with each other in each sub-band, in units of the noise.
     """
 
     def __init__(self, evidence: Evidence, walls: FloatArray) -> None:
@@ -94,7 +96,7 @@ class SparseFit:
         self.components: list[Component] = []
         self.residual = evidence.heard
         self.precision = Precision(evidence, [])
-        self._gram = np.zeros((evidence.sub_bands, 0, 0))
+        self.gram = np.zeros((evidence.sub_bands, 0, 0))
         self._product = np.zeros((evidence.sub_bands, 0))
         self._energy = self._bands(evidence.heard, self.precision.times(evidence.heard))
 
@@ -274,13 +276,13 @@ class SparseFit:
         evidence, count = self.evidence, len(self.components)
         self.residual = evidence.heard.copy()
         if count == 0:
-            self._gram = np.zeros((evidence.sub_bands, 0, 0))
+            self.gram = np.zeros((evidence.sub_bands, 0, 0))
             self._product = np.zeros((evidence.sub_bands, 0))
             return
         columns = np.stack([component.column for component in self.components])
-        self._gram, self._product = self._products(columns, self.precision.times(columns))
+        self.gram, self._product = self._products(columns, self.precision.times(columns))
         strengths = np.zeros((count, evidence.sub_bands))
-        for band, (gram, product) in enumerate(zip(self._gram, self._product, strict=True)):
+        for band, (gram, product) in enumerate(zip(self.gram, self._product, strict=True)):
             root, scale = _scaled_root(gram)
             solved, _ = nnls(root.T, np.linalg.solve(root, product * scale))
             strengths[:, band] = solved * scale
@@ -308,7 +310,7 @@ class SparseFit:
         misfit = float(self._energy.sum())
         if not kept:
             return misfit
-        for gram, product in zip(self._gram, self._product, strict=True):
+        for gram, product in zip(self.gram, self._product, strict=True):
             own, match = gram[np.ix_(kept, kept)], product[kept]
             root, scale = _scaled_root(own)
             strength = nnls(root.T, np.linalg.solve(root, match * scale))[0] * scale
@@ -322,13 +324,13 @@ class SparseFit:
 
     def _bordered(self, own: Single, weighted: Single) -> FloatArray:
         """Normal matrix of some columns, and behind them all strengths, sub-band by sub-band."""
-        starts, count, bands = self.evidence.table.starts, len(own), len(self._gram)
+        starts, count, bands = self.evidence.table.starts, len(own), len(self.gram)
         components = len(self.components)
         matrix = np.zeros((count + bands * components, count + bands * components))
         flat = weighted.reshape(count, -1)
         matrix[:count, :count] = flat @ own.reshape(count, -1).T
         columns = np.stack([component.column for component in self.components])
-        for band, gram in enumerate(self._gram):
+        for band, gram in enumerate(self.gram):
             part = slice(starts[band], starts[band + 1])
             place = slice(count + band * components, count + (band + 1) * components)
             left = weighted[:, :, part].reshape(count, -1)
@@ -368,7 +370,7 @@ class SparseFit:
         hessian = self._bordered(own, weighted)
         gradient = np.zeros(len(hessian))
         gradient[: len(own)] = weighted.reshape(len(own), -1) @ self.residual.ravel()
-        rest = self._product - np.einsum("bkl,lb->bk", self._gram, self._strengths)
+        rest = self._product - np.einsum("bkl,lb->bk", self.gram, self._strengths)
         gradient[len(own) :] = rest.ravel()
         for position, (component, axis) in enumerate(owners):
             hold = HOLD if axis < 2 else SHARE_SIGMA[Share(axis)] ** -2

@@ -1,21 +1,56 @@
+import dataclasses
+
 import numpy as np
+import pytest
 
-from soundmap.detect.significance import GHOST_GAIN, GHOST_RATE, false_alarm_probabilities
+from soundmap.detect.significance import GHOST_RATE, Marks, false_alarm_probabilities, log_odds
+
+USUAL = Marks(
+    gain=np.array([400.0]),
+    steadiness=np.array([5.0]),
+    area_m2=np.array([0.05**2]),
+    behind_m=np.array([0.0]),
+    on_surface=np.array([True]),
+)
 
 
-def test_a_ghost_of_the_usual_size_is_as_probable_as_was_measured():
-    (value,) = false_alarm_probabilities(np.array([GHOST_GAIN]), np.array([True]))
-    np.testing.assert_allclose(value, GHOST_RATE, rtol=1e-6)
+@pytest.mark.parametrize(
+    "worse",
+    [
+        {"gain": np.array([200.0])},
+        {"steadiness": np.array([2.0])},
+        {"area_m2": np.array([0.01])},
+        {"behind_m": np.array([0.4])},
+        {"on_surface": np.array([False])},
+    ],
+    ids=lambda marks: next(iter(marks)),
+)
+def test_whatever_ghosts_are_like_makes_a_false_alarm_likelier(worse):
+    (usual,) = false_alarm_probabilities(USUAL)
+    (ghostly,) = false_alarm_probabilities(dataclasses.replace(USUAL, **worse))
+    assert ghostly > 1.5 * usual
 
 
-def test_what_stands_in_the_open_or_beside_something_loud_has_to_explain_more():
-    alone, in_open = false_alarm_probabilities(np.array([400.0, 400.0]), np.array([True, False]))
-    assert alone < 0.1 * in_open
-    beside, _ = false_alarm_probabilities(np.array([400.0, 20_000.0]), np.array([True, True]))
+def test_beside_something_loud_the_same_is_likelier_a_ghost():
+    both = Marks(*(np.repeat(getattr(USUAL, field.name), 2) for field in dataclasses.fields(Marks)))
+    alone, _ = false_alarm_probabilities(both)
+    beside, _ = false_alarm_probabilities(dataclasses.replace(both, gain=np.array([400.0, 9e3])))
     assert beside > 10.0 * alone
 
 
+def test_even_odds_are_as_probable_as_was_measured():
+    score = log_odds(USUAL)
+    even = dataclasses.replace(USUAL, steadiness=USUAL.steadiness * np.exp(-score / 2.0))
+    np.testing.assert_allclose(false_alarm_probabilities(even), GHOST_RATE, rtol=1e-6)
+
+
 def test_probabilities_stay_between_0_and_1():
-    gains = np.array([0.0, 1e-3, 1e9])
-    values = false_alarm_probabilities(gains, np.array([True, False, True]))
+    extreme = Marks(
+        gain=np.array([0.0, 1e-3, 1e9]),
+        steadiness=np.array([0.0, 0.0, 1e9]),
+        area_m2=np.array([1.0, 1e-4, 1e-4]),
+        behind_m=np.array([2.0, 0.0, 0.0]),
+        on_surface=np.array([False, False, True]),
+    )
+    values = false_alarm_probabilities(extreme)
     assert np.all((values >= 0.0) & (values <= 1.0))
