@@ -23,7 +23,7 @@ from soundmap.detect.growth import grown_fit
 from soundmap.detect.harmonics import Single
 from soundmap.detect.matched_filter import effective_number
 from soundmap.detect.placement import Placement, placement, surface_odds
-from soundmap.detect.reflections import told_reflections
+from soundmap.detect.reflections import is_at_mirror, told_reflections
 from soundmap.detect.regions import Region, regions
 from soundmap.detect.significance import Marks, false_alarm_probabilities
 from soundmap.detect.sound_paths import Kind, Path
@@ -185,6 +185,9 @@ def _source(fit: SparseFit, told: _Told, stretch: NDArray[np.int64]) -> Source:
     flags = []
     if not told.placement.on_surface:
         flags.append("not_seen_by_laser")
+    louder = [c.place_m for c in fit.components if c.strength.sum() > power]
+    if is_at_mirror(component.place_m, np.reshape(louder, (-1, 2)), fit.walls):
+        flags.append("reflection_suspected")
     if arc < ONE_SIDE_RAD:
         flags.append("seen_from_one_side")
     if _silent_share(strength, told_of, component.strength) > UNSTEADY_SHARE:

@@ -9,6 +9,7 @@ import numpy as np
 from soundmap.detect.evidence import Evidence
 from soundmap.detect.sound_paths import Path
 from soundmap.detect.sparse_fit import Component
+from soundmap.geometry import FloatArray
 from soundmap.sound import Reflection, Source
 
 TOLERANCE_M = 0.35
@@ -35,6 +36,29 @@ def told_reflections(
         )
         for evidence, image in loudest_first
     )
+
+
+def is_at_mirror(place_m: FloatArray, louder_m: FloatArray, walls: FloatArray) -> bool:
+    """Whether a place is where some wall would mirror something louder.
+
+    Parameters
+    ----------
+    place_m : ndarray, shape (2,)
+    louder_m : ndarray, shape (K, 2)
+    walls : ndarray, shape (W, 3)
+        Unit normal and offset of each.
+
+    Examples
+    --------
+    >>> wall = np.array([[1.0, 0.0, 3.0]])
+    >>> is_at_mirror(np.array([4.1, 1.0]), np.array([[2.0, 1.1]]), wall)
+    True
+    """
+    normal, offset = walls[:, :2], walls[:, 2]
+    off = louder_m @ normal.T - offset
+    images = louder_m[:, None] - 2.0 * off[..., None] * normal
+    away = np.hypot(*(images - place_m).reshape(-1, 2).T)
+    return bool(away.min(initial=np.inf) < TOLERANCE_M)
 
 
 def _mirrored_source(evidence: Evidence, image: Component, sources: Sequence[Source]) -> int | None:
