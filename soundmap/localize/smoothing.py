@@ -156,14 +156,38 @@ def _marginal_covariance(diagonal: FloatArray, coupling: FloatArray) -> FloatArr
     """Covariance of each pose, shape (K, 3, 3): the diagonal blocks of the system's inverse."""
     forward, backward = diagonal.copy(), diagonal.copy()
     for k in range(len(coupling)):
-        forward[k + 1] -= coupling[k].T @ np.linalg.solve(forward[k], coupling[k])
+        _eliminate(forward[k], coupling[k], forward[k + 1])
     for k in range(len(coupling) - 1, -1, -1):
-        turned = np.ascontiguousarray(coupling[k].T)
-        backward[k] -= coupling[k] @ np.linalg.solve(backward[k + 1], turned)
+        _eliminate(backward[k + 1], coupling[k].T, backward[k])
     covariance = np.empty(diagonal.shape)
     for k in range(len(diagonal)):
-        covariance[k] = np.linalg.inv(forward[k] + backward[k] - diagonal[k])
+        covariance[k] = _inverse(forward[k] + backward[k] - diagonal[k])
     return covariance
+
+
+@njit(cache=True, nogil=True)
+def _eliminate(own, coupling, other):  # type: ignore[no-untyped-def]
+    """Takes from a neighbour's block what a pose's own unknowns, (3, 3) each, explain of it."""
+    inverse = _inverse(own)
+    for i in range(3):
+        for j in range(3):
+            for a in range(3):
+                for b in range(3):
+                    other[i, j] -= coupling[a, i] * inverse[a, b] * coupling[b, j]
+
+
+@njit(cache=True, nogil=True)
+def _inverse(matrix):  # type: ignore[no-untyped-def]
+    """Inverse of a matrix (3, 3) by cofactors: linear algebra takes seconds to compile."""
+    cofactor = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            k, m, p, q = (i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3
+            cofactor[j, i] = matrix[k, p] * matrix[m, q] - matrix[k, q] * matrix[m, p]
+    volume = 0.0
+    for j in range(3):
+        volume += matrix[0, j] * cofactor[j, 0]
+    return cofactor / volume
 
 
 def carried(pose: FloatArray, step: FloatArray, trusted: NDArray[np.bool_]) -> FloatArray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +18,8 @@ from soundmap.localize.wall_lines import has_line, line_pull, wall_lines
 
 KERNEL_M = 0.15
 """Width of the robust kernel of the points that the map explains [m]."""
+VIEWS_AT_ONCE = 1024
+"""Views whose returns are placed at once; bounds the memory of long runs."""
 MAP_SHARE = 0.1
 """Weight that the map's own cells keep where the run's returns draw a line in them."""
 
@@ -59,9 +63,9 @@ class WallFit:
 
         if not by_lines:
             return lambda at: without_hearsay(*by_map(at))
-        points = transformed(np.repeat(pose, np.diff(first), axis=0), points_m)
-        lines = wall_lines(self._surface, points)
-        share[has_line(self._surface, lines, points)] = MAP_SHARE
+        lines = wall_lines(self._surface, (part for _, part in _placed(pose, points_m, first)))
+        for own, part in _placed(pose, points_m, first):
+            share[own][has_line(self._surface, lines, part)] = MAP_SHARE
 
         def by_both(at: FloatArray) -> tuple[FloatArray, FloatArray]:
             information, pull = line_pull(
@@ -71,3 +75,14 @@ class WallFit:
             return without_hearsay(weight * information + map_information, weight * pull + map_pull)
 
         return by_both
+
+
+def _placed(
+    pose: FloatArray, points_m: NDArray[np.float32], first: NDArray[np.int64]
+) -> Iterator[tuple[slice, FloatArray]]:
+    """The returns of some views at a time in the map frame, and which they are."""
+    for start in range(0, len(pose), VIEWS_AT_ONCE):
+        ends = first[start : start + VIEWS_AT_ONCE + 1]
+        own = slice(int(ends[0]), int(ends[-1]))
+        at = np.repeat(pose[start : start + VIEWS_AT_ONCE], np.diff(ends), axis=0)
+        yield own, transformed(at, points_m[own])

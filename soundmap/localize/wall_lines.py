@@ -9,6 +9,7 @@ distributions transform", IROS 2003).
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,23 +42,26 @@ class WallLines:
     offset_m: FloatArray
 
 
-def wall_lines(surface: Surface, points_m: FloatArray) -> WallLines:
+def wall_lines(surface: Surface, points_m: Iterable[FloatArray]) -> WallLines:
     """Lines through the returns about each surface cell and its neighbours.
 
     Parameters
     ----------
     surface : Surface
-    points_m : ndarray, shape (P, 2)
-        Laser returns of the whole run in the map frame [m].
+    points_m : iterable of ndarray, shape (P, 2)
+        Laser returns of the whole run in the map frame [m], part by part.
     """
-    moments = _moments(
-        surface.nearest,
-        surface.centre_m,
-        surface.corner_m,
-        surface.resolution_m,
-        np.ascontiguousarray(points_m),
-        REACH_M,
-    )
+    moments = np.zeros((len(surface.centre_m), 6))
+    for part in points_m:
+        _add_moments(
+            moments,
+            surface.nearest,
+            surface.centre_m,
+            surface.corner_m,
+            surface.resolution_m,
+            np.ascontiguousarray(part),
+            REACH_M,
+        )
     count, x, y, xx, xy, yy = _with_neighbours(surface.own, surface.cell, moments).T
     total = np.maximum(count, 1.0)
     mean = np.stack([x, y], axis=-1) / total[:, None]
@@ -110,17 +114,17 @@ def line_pull(
 
 
 @njit(cache=True, nogil=True)
-def _moments(
+def _add_moments(
+    moments: FloatArray,
     nearest: NDArray[np.int32],
     centre: FloatArray,
     corner: FloatArray,
     resolution: float,
     points: FloatArray,
     reach: float,
-) -> FloatArray:
-    """Count, sums and sums of products of the points nearest to each surface cell, (C, 6)."""
+) -> None:
+    """Adds count, sums and sums of products of the points nearest to each surface cell, (C, 6)."""
     rows, columns = nearest.shape
-    moments = np.zeros((len(centre), 6))
     for i in range(len(points)):
         x, y = points[i, 0] - corner[0], points[i, 1] - corner[1]
         column, row = int(np.floor(x / resolution)), int(np.floor(y / resolution))
@@ -135,7 +139,6 @@ def _moments(
         moments[cell, 3] += x * x
         moments[cell, 4] += x * y
         moments[cell, 5] += y * y
-    return moments
 
 
 @njit(cache=True, nogil=True)

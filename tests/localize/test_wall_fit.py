@@ -93,7 +93,7 @@ def test_lines_stand_where_the_returns_are_and_not_where_the_cells_are():
     rng = np.random.default_rng(1)
     x = rng.uniform(0.2, 2.8, 2000)
     points = np.column_stack([x, 1.005 + 0.01 * x + rng.normal(0, 0.01, 2000)])
-    lines = wall_lines(surface, points)
+    lines = wall_lines(surface, [points])
     assert has_line(surface, lines, points).mean() > 0.95
     exists = np.any(lines.normal != 0, axis=1)
     middle = surface.centre_m[exists]
@@ -105,7 +105,7 @@ def test_lines_stand_where_the_returns_are_and_not_where_the_cells_are():
 
 def test_poses_fitted_to_lines_agree_to_millimetres():
     surface = map_surface(ROOM)
-    lines = wall_lines(surface, transformed(np.repeat(POSES, np.diff(FIRST), axis=0), FLAT))
+    lines = wall_lines(surface, [transformed(np.repeat(POSES, np.diff(FIRST), axis=0), FLAT)])
 
     def by_lines(pose):
         return line_pull(surface, lines, pose, FLAT, FIRST, sigma_m=0.05, kernel_m=0.15)
@@ -120,9 +120,9 @@ def test_scattered_returns_and_few_returns_are_no_line():
     surface = map_surface(ROOM)
     rng = np.random.default_rng(3)
     cloud = surface.centre_m[100] + rng.normal(0, 0.05, (500, 2))
-    assert has_line(surface, wall_lines(surface, cloud), cloud).mean() < 0.05
+    assert has_line(surface, wall_lines(surface, [cloud]), cloud).mean() < 0.05
     few = surface.centre_m[100] + np.linspace(-0.02, 0.02, 3)[:, None] * [1.0, 0.0]
-    assert not has_line(surface, wall_lines(surface, few), few).any()
+    assert not has_line(surface, wall_lines(surface, [few]), few).any()
 
 
 def test_points_far_from_every_wall_do_not_pull():
