@@ -42,6 +42,8 @@ ONE_SOURCE_M = 0.55
 """Components nearer to each other than this are one source."""
 STRETCH_M = 0.5
 ONE_SIDE_RAD = np.radians(40.0)
+LOUD_SIDE = 0.75
+"""Share of all that is told of a source that makes it no louder than along its axis."""
 SILENT, UNSTEADY_SHARE = 0.3, 0.35
 """A source is unsteady if it has less than this share of its strength in so much of what tells."""
 
@@ -190,10 +192,11 @@ def _source(fit: SparseFit, told: _Told, stretch: NDArray[np.int64]) -> Source:
         flags.append("reflection_suspected")
     if arc < ONE_SIDE_RAD:
         flags.append("seen_from_one_side")
-    if _silent_share(strength, told_of, component.strength) > UNSTEADY_SHARE:
+    along = _relative(strength, told_of, component.strength)
+    if _silent_share(*along) > UNSTEADY_SHARE:
         flags.append("unsteady")
     details = SourceFit(
-        power,
+        power * _loud_side(*along),
         told.placement.covariance_m2,
         told.probability,
         arc,
@@ -222,8 +225,20 @@ def _relative(
     return (weight * value).sum(axis=1)[kept] / total[kept], total[kept]
 
 
-def _silent_share(strength: FloatArray, told: FloatArray, mean: FloatArray) -> float:
-    value, weight = _relative(strength, told, mean)
+def _loud_side(value: FloatArray, weight: FloatArray) -> float:
+    """Strength on the side that a source faces, over its mean one.
+
+    Sources radiate less to their sides and backs. What a quarter of the way exceeds comes near to
+    what they radiate along their axis, and does not hang on the loudest stretch.
+    """
+    if not len(value):
+        return 1.0
+    order = np.argsort(value)
+    below = np.cumsum(weight[order])
+    return max(float(value[order][np.searchsorted(below, LOUD_SIDE * below[-1])]), SILENT)
+
+
+def _silent_share(value: FloatArray, weight: FloatArray) -> float:
     heard = np.sqrt(weight)  # near stretches shall not decide alone
     return float(heard[value < SILENT].sum() / max(heard.sum(), 1e-30))
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from soundmap.config import DetectConfig, ScanConfig
-from soundmap.detect.fitted_sources import fitted_sources
+from soundmap.detect.fitted_sources import _loud_side, fitted_sources
 from soundmap.geometry import Mount, Trajectory
 from soundmap.sensors import MicArray
 from soundmap.sound import AudioScans, LevelReference
@@ -117,3 +117,11 @@ def test_an_image_behind_a_wall_is_told_from_the_source_in_front_of_another():
 @pytest.mark.parametrize("seed", range(3))
 def test_a_silent_run_has_no_source(seed):
     assert len(run([], seed=seed)) == 0
+
+
+def test_the_level_is_that_of_the_loud_side_whatever_one_loud_stretch_says():
+    weight = np.ones(8)
+    facing = np.array([0.2, 0.3, 0.5, 0.8, 1.1, 1.4, 1.5, 6.0])
+    assert _loud_side(facing, weight) == 1.4
+    assert _loud_side(np.ones(1), np.ones(1)) == 1.0
+    assert _loud_side(np.zeros(0), np.zeros(0)) == 1.0
