@@ -78,6 +78,9 @@ def compared(run: Path, background: Path, diff: DiffConfig, detect: DetectConfig
     room, other_room = read_map(run / "map.yaml"), read_map(background / "map.yaml")
     notes = LossLedger()
     pose = _pose_of_background(room, other_room, notes)
+    if (loud.is_limit is None) != (quiet.is_limit is None):
+        what = "the power maps of the two runs were made by different methods"
+        notes.remark(what, STAGE, effect="the levels of their cells cannot be compared")
     here = cell_levels(loud, min_visit_share=loud_share)
     there = cell_levels(quiet, min_visit_share=quiet_share)
     ratio, measured = power_ratio(here, loud.frame, there, quiet.frame, inverted(pose))

@@ -18,6 +18,7 @@ from soundmap.detect.source_list import detect_sources
 from soundmap.errors import ConfigError, NothingUsableError
 from soundmap.fuse.accumulate import PowerAccumulator
 from soundmap.fuse.bearing_range import ranges_around
+from soundmap.fuse.fitted_map import fitted_power_map
 from soundmap.fuse.power_map import fused_scans, level_reference, power_map_frame
 from soundmap.fuse.surroundings import SurroundingsGatherer
 from soundmap.geometry import Trajectory
@@ -107,6 +108,9 @@ def process(
                 scans, around, trajectory, array, config.scan, config.detect, room=room
             )
             sources = with_level_errors(sources, scans, trajectory, array, room, config.scan)
+            power_map = fitted_power_map(
+                sources, scans, around, trajectory, array, frame, config.scan, config.fuse
+            )
         else:
             sources = detect_sources(power_map, config.detect)
     return Run(

@@ -153,7 +153,7 @@ def _tell_fusion(log: RobotLog, run: Run, drawn: RunRecording) -> None:
         if scan.time_ns >= due_ns:
             drawn.add_power_map(scan.time_ns, accumulator.power_map())
             due_ns += step_ns
-    drawn.add_power_map(int(run.scans.time_ns[-1]), accumulator.power_map())
+    drawn.add_power_map(int(run.scans.time_ns[-1]), run.power_map)
 
 
 def _in_map(scan: LaserScan, run: Run, time_ns: int) -> FloatArray:

@@ -171,6 +171,9 @@ class PowerMap:
     reference : LevelReference
     square_sum : ndarray, shape (H, W), or None
         Sum of the squares of the shares, which tells how they scatter; None if unknown.
+    is_limit : ndarray of bool, shape (H, W), or None
+        Where the power is only the most that can be there: no source was found in that cell. None
+        if all cells hold what was measured.
     """
 
     frame: GridFrame
@@ -178,8 +181,11 @@ class PowerMap:
     visits: NDArray[np.int64]
     reference: LevelReference
     square_sum: FloatArray | None = None
+    is_limit: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
+        if self.is_limit is not None and self.is_limit.shape != self.frame.shape:
+            raise ValueError("a power map needs one mark of limits a cell")
         if self.power_sum.shape != self.frame.shape or self.visits.shape != self.frame.shape:
             raise ValueError("a power map needs one sum and one count a cell")
         if self.square_sum is not None and self.square_sum.shape != self.frame.shape:

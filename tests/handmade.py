@@ -111,6 +111,16 @@ def fitted_run(log: Path = Path("logs/run1.mcap")) -> Run:
     return replace(run, sources=SourceList(sources, FULL_SCALE, images))
 
 
+def limited_run(log: Path = Path("logs/run1.mcap")) -> Run:
+    """A run with sources of a fit, and a power map that holds limits but near them."""
+    run = fitted_run(log)
+    power_map = run.power_map
+    centres = power_map.frame.centres(np.stack(np.indices(power_map.frame.shape), axis=-1))
+    places = np.array([(source.x_m, source.y_m) for source in run.sources])
+    distance = np.hypot(*np.moveaxis(centres[..., None, :] - places, -1, 0))
+    return replace(run, power_map=replace(power_map, is_limit=distance.min(axis=-1) > 0.3))
+
+
 def calibrated_run(log: Path = Path("logs/run1.mcap")) -> Run:
     """A run whose audio was late, and whose array was turned as believed."""
     clock = Offset(0.0503, 0.0041, OffsetVerdict.CORRECTED)

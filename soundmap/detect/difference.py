@@ -32,11 +32,14 @@ class CellLevels:
         Standard error of it; NaN where unknown.
     freedom : ndarray, shape (H, W)
         Degrees of freedom that the standard error rests on.
+    is_limit : ndarray of bool, shape (H, W), or None
+        Where the level is only the most that can be there; None: nowhere.
     """
 
     level_db: FloatArray
     sigma_db: FloatArray
     freedom: FloatArray
+    is_limit: NDArray[np.bool_] | None = None
 
     @property
     def scatter_db(self) -> float:
@@ -55,7 +58,7 @@ def cell_levels(power_map: PowerMap, *, min_visit_share: float) -> CellLevels:
         relative = power_map.spread() / power / np.sqrt(independent)
     freedom = np.maximum(independent - 1.0, 0.0)
     sigma = np.where(freedom > 0.0, DECIBELS_PER_SHARE * relative, np.nan)
-    return CellLevels(decibels(power), sigma, freedom)
+    return CellLevels(decibels(power), sigma, freedom, power_map.is_limit)
 
 
 def power_ratio(
@@ -71,7 +74,8 @@ def power_ratio(
     centre. Where the background run measured nothing, nothing
     there was the strongest candidate of any of its scans, so the place was no louder than what
     was: the median of the background's measured cells stands in, and their scatter is its error.
-    Where the run itself measured nothing, there is no ratio.
+    Where the run itself measured nothing, there is no ratio. Where both only know the most that
+    can be there, they tell of no difference: the ratio is 0 dB.
 
     Parameters
     ----------
@@ -103,7 +107,7 @@ def power_ratio(
     inside = background_frame.contains(cells)
     row, column = np.where(inside, cells[..., 0], 0), np.where(inside, cells[..., 1], 0)
 
-    def beneath(values: FloatArray) -> FloatArray:
+    def beneath(values: FloatArray | NDArray[np.bool_]) -> FloatArray:
         return np.where(inside, values[row, column], np.nan)
 
     level = beneath(background.level_db)
@@ -116,6 +120,9 @@ def power_ratio(
         variance = run.sigma_db**2 + sigma**2
         shares = run.sigma_db**4 / run.freedom + sigma**4 / freedom
         together = np.where(variance > 0.0, variance**2 / shares, np.inf)
+    if run.is_limit is not None and background.is_limit is not None:
+        untold = run.is_limit & (~measured | beneath(background.is_limit).astype(bool))
+        ratio = np.where(untold & np.isfinite(ratio), 0.0, ratio)
     return CellLevels(ratio, np.sqrt(variance), together), measured
 
 

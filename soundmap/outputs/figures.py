@@ -15,7 +15,7 @@ from soundmap.grid import GridFrame, OccupancyGrid
 from soundmap.outputs.area import area_of_interest
 from soundmap.outputs.floor import DOUBTFUL, FOUND, FloorPlan, Mark, Places
 from soundmap.run import Run
-from soundmap.sound import SourceList, decibels
+from soundmap.sound import PowerMap, SourceList, decibels
 
 # Okabe and Ito's colours, told apart with any kind of colour vision.
 BLUE, VERMILION, GREEN = "#0072B2", "#D55E00", "#009E73"
@@ -76,6 +76,7 @@ def power_map_figure(run: Run, *, truth: Places = ()) -> Figure:
         part,
         origin="lower",
         extent=extent,
+        alpha=_opacity_of_limits(plan, power_map),
         cmap="viridis",
         vmin=low,
         vmax=high,
@@ -84,9 +85,13 @@ def power_map_figure(run: Run, *, truth: Places = ()) -> Figure:
     if np.isnan(level).all():
         say_nothing_measured(plan.axes)
     else:
-        label = f"mean emitted power{_blocks(plan, power_map.frame)} [{written(power_map)}]"
+        what = "mean emitted power" if power_map.is_limit is None else "power at 1 m"
+        label = f"{what}{_blocks(plan, power_map.frame)} [{written(power_map)}]"
         plan.add_colour_bar(image, label, "min" if np.any(level < low) else "neither")
     plan.draw_wall_outlines()
+    if power_map.is_limit is not None:
+        pale = image.to_rgba(np.array([0.5 * (low + high)]), alpha=PALE)[0]
+        plan.axes.plot([], [], "s", color=pale, label="pale: at most so loud")
     plan.axes.plot(*run.trajectory.pose[:, :2].T, color="0.45", linewidth=0.8, label="trajectory")
     _draw_sources(plan, run.sources)
     plan.draw_truth(truth)
@@ -156,6 +161,14 @@ def _draw_sources(plan: FloorPlan, sources: SourceList) -> None:
 def _is_sure(change: Change) -> bool:
     chance = change.false_alarm_probability
     return chance is not None and chance < SURE
+
+
+def _opacity_of_limits(plan: FloorPlan, power_map: PowerMap) -> FloatArray | None:
+    """Of each square of a power map: pale where it only shows the most that can be there."""
+    if power_map.is_limit is None:
+        return None
+    limit, _ = plan.blocks(power_map.is_limit, power_map.frame, np.min)
+    return np.where(limit, PALE, 1.0)
 
 
 def _opacity(plan: FloorPlan, ratio: PowerRatio) -> FloatArray | None:

@@ -25,9 +25,10 @@ from soundmap.sensors import OffsetVerdict
 
 KINDS = ("appeared", "louder", "quieter", "gone", "unchanged", "untold")
 CAPTIONS = {
-    "power_map": "Where it is loud: mean emitted power over the geometric map. Cells without "
-    "colour were not measured, or too rarely to count; they need not be quiet. Ellipses hold their "
-    "source with 95 %; they are drawn where that is more than the mark covers.",
+    "power_map": "Where it is loud, over the geometric map. Cells without colour were not "
+    "measured, or too rarely to count; they need not be quiet. Pale cells show the most that can "
+    "be there, where no source was found. Ellipses hold their source with 95 %; they are drawn "
+    "where that is more than the mark covers.",
     "trajectory": "Where the robot was: its way in the geometric map, with the sources found.",
     "audio_scans": "What the array heard: level on every bearing over time, and below it the "
     "level of the loudest bearing and the mean of all.",

@@ -122,7 +122,7 @@ class RunRecording:
     def add_power_map(self, time_ns: int, power_map: PowerMap) -> None:
         """The power map as it was at a time; every cell measured so far."""
         level = decibels(power_map.power())
-        self._send_grid("/world/run/power", level, power_map.frame, time_ns)
+        self._send_grid("/world/run/power", level, power_map, time_ns)
 
     @property
     def power_map_bytes(self) -> int:
@@ -141,7 +141,7 @@ class RunRecording:
 
     def _draw_results(self) -> None:
         run, stream = self._run, self._stream
-        self._send_grid("/world/result/power", self._level, run.power_map.frame, None)
+        self._send_grid("/world/result/power", self._level, run.power_map, None)
         rows = source_rows(run.sources)
         places = [(source.x_m, source.y_m) for source in run.sources]
         labels = [f"{row['id']}  {level_text(row)} dB" for row in rows]
@@ -259,13 +259,17 @@ class RunRecording:
         self._stream.log("/world/run/laser_hit", style, static=True)
 
     def _send_grid(
-        self, name: str, level: FloatArray, frame: GridFrame, time_ns: int | None
+        self, name: str, level: FloatArray, power_map: PowerMap, time_ns: int | None
     ) -> None:
+        frame = power_map.frame
         part, (left, _, bottom, _) = cropped(level, frame, self._measured)
         share = (not_below(part.astype(np.float64), self._low) - self._low) / (
             self._high - self._low
         )
         rgba = coloured(np.clip(share, 0.0, 1.0), "viridis")
+        if power_map.is_limit is not None:
+            limit, _ = cropped(power_map.is_limit, frame, self._measured)
+            rgba[..., 3] = np.where(limit, PALE * rgba[..., 3], rgba[..., 3])
         grid = floor_picture(rgba, frame.resolution_m, (left, bottom), POWER_Z)
         if time_ns is None:
             self._stream.log(name, grid, static=True)

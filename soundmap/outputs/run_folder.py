@@ -152,12 +152,14 @@ def tum_text(trajectory: Trajectory) -> str:
 def power_map_arrays(power_map: PowerMap, *, min_visit_share: float) -> dict[str, ArrayLike]:
     """Content of ``power_map.npz``: what people read, and the sums that merge exactly."""
     squares = {} if power_map.square_sum is None else {"square_sum": power_map.square_sum}
+    limits = {} if power_map.is_limit is None else {"is_limit": power_map.is_limit}
     return {
         "power": power_map.power(min_visit_share=min_visit_share),
         "visits": power_map.visits,
         **_frame_arrays(power_map.frame),
         "power_sum": power_map.power_sum,
         **squares,
+        **limits,
         "min_visit_share": min_visit_share,
         "reference": str(power_map.reference),
         "power_unit": str(power_map.reference).removeprefix("dB re "),

@@ -211,9 +211,9 @@ def _power_map(stored: Stored) -> PowerMap:
     reference = LevelReference(str(stored["reference"]))
     frame = _frame(stored, visits)
     squares = stored["square_sum"].astype(np.float64) if "square_sum" in stored else None
-    return PowerMap(
-        frame, power_sum.astype(np.float64), visits.astype(np.int64), reference, squares
-    )
+    limits = stored["is_limit"].astype(bool) if "is_limit" in stored else None
+    power_sum, visits = power_sum.astype(np.float64), visits.astype(np.int64)
+    return PowerMap(frame, power_sum, visits, reference, squares, limits)
 
 
 def _audio_scans(stored: Stored) -> AudioScans:

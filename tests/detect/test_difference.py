@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -44,6 +46,21 @@ def test_ten_times_the_power_is_ten_decibels():
     power, _ = maps()
     ratio, _ = ratio_of(10 * power, FRAME, power, FRAME)
     assert ratio == pytest.approx(10.0)
+
+
+def test_two_limits_tell_of_no_difference_but_a_source_against_a_limit_does():
+    power, background = maps()
+    ones = np.ones(FRAME.shape, dtype=bool)
+    some = ones.copy()
+    some[3, 4] = False
+    background[7, 8] = np.nan
+    run = dataclasses.replace(known(10 * power), is_limit=some)
+    other = dataclasses.replace(known(background), is_limit=ones)
+    ratio, measured = power_ratio(run, FRAME, other, FRAME)
+    assert not measured[7, 8]
+    assert (ratio.level_db[some] == 0.0).all()
+    assert (chance(ratio)[some] == 1.0).all()
+    assert ratio.level_db[3, 4] == pytest.approx(decibels(10 * power / background)[3, 4])
 
 
 def test_grids_need_not_coincide():

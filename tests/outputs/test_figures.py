@@ -6,6 +6,7 @@ import pytest
 from handmade import (
     fitted_run,
     heard_map,
+    limited_run,
     made_ratio,
     made_run,
     round_trip,
@@ -45,6 +46,16 @@ def test_the_trajectory_shows_its_ends_its_lost_part_and_the_sources():
     start, end = (line for line in figure.axes[0].lines if line.get_label() in ("start", "end"))
     assert start.get_xydata()[0].tolist() == made_run().trajectory.pose[0, :2].tolist()
     assert end.get_xydata()[0].tolist() == made_run().trajectory.pose[-1, :2].tolist()
+
+
+def test_what_is_only_a_limit_is_pale_and_the_legend_says_so():
+    run = limited_run()
+    figure = power_map_figure(run)
+    alpha = figure.axes[0].images[-1].get_alpha()
+    assert set(np.unique(alpha)) == {0.3, 1.0}
+    assert np.sum(alpha == 1.0) == np.sum(~run.power_map.is_limit)
+    assert "pale: at most so loud" in legend(figure)
+    assert "pale: at most so loud" not in legend(power_map_figure(fitted_run()))
 
 
 def test_a_wholly_usable_trajectory_has_no_lost_part_in_its_legend():

@@ -6,7 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rerun as rr
-from handmade import START_NS, fitted_run, made_ratio, made_run, unlucky_run, walled_room
+from handmade import (
+    START_NS,
+    fitted_run,
+    limited_run,
+    made_ratio,
+    made_run,
+    unlucky_run,
+    walled_room,
+)
 from rerun.chunk import RrdReader
 
 from soundmap.geometry import Mount
@@ -119,6 +127,15 @@ def test_the_map_is_the_right_way_up(tmp_path, run):
     assert wall.tolist() == [90, 95, 105, 255]
     assert floor.tolist() == [236, 238, 240, 255]
     assert recorded.corner_m("/world/map") == pytest.approx([-0.5, -0.5])
+
+
+def test_limits_are_pale(tmp_path):
+    run = limited_run()
+    file = tmp_path / "run.rrd"
+    with run_recording(run, file):
+        pass
+    alpha = Recorded(file).picture("/world/result/power")[..., 3]
+    assert set(np.unique(alpha)) == {0, 76, 255}
 
 
 def test_the_power_map_shows_its_loudest_cell_where_it_is_and_nothing_unmeasured(recorded, run):

@@ -4,7 +4,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from handmade import NO_PICTURES, fitted_run, made_ratio, made_run, unlucky_run, walled_room
+from handmade import (
+    NO_PICTURES,
+    fitted_run,
+    limited_run,
+    made_ratio,
+    made_run,
+    unlucky_run,
+    walled_room,
+)
 
 from soundmap.config import DiffConfig
 from soundmap.errors import LogError
@@ -26,6 +34,11 @@ def same(first: object, second: object) -> bool:
     if hasattr(first, "__dataclass_fields__"):
         return all(same(getattr(first, f.name), getattr(second, f.name)) for f in fields(first))
     return first == second
+
+
+def test_limits_read_back_as_limits(tmp_path):
+    run = limited_run()
+    assert same(read_run(written(run, tmp_path)).power_map, run.power_map)
 
 
 def test_a_run_reads_back_as_it_was(tmp_path):
