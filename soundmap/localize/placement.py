@@ -17,7 +17,7 @@ from soundmap.geometry import FloatArray, composed, relative
 from soundmap.grid import OccupancyGrid
 from soundmap.localize.following import Follower, Track
 from soundmap.localize.global_start import start_hypotheses
-from soundmap.localize.hypotheses import FIRST_SPAN, Followed, surviving
+from soundmap.localize.hypotheses import FIRST_SPAN, LEAST_GAP, Followed, surviving
 from soundmap.localize.views import STAGE, Views
 from soundmap.losses import LossLedger
 
@@ -38,6 +38,9 @@ TOGETHER_NS = 300_000_000
 """Views this close together are matched to the map as one."""
 LOST_M, LOST_S = 1.0, 2.0
 """Views that do not match over so much way, or time, make a lost stretch."""
+MOST_MENDED = 20
+"""Jumps of the trajectory that are followed across."""
+ALL = slice(None)
 CANNOT_TELL = (
     "the pose cannot be told from the laser scans: the map looks alike in several places, and the "
     "whole run fits it from each of them. Give the start with --start-pose X,Y,DEG."
@@ -107,6 +110,7 @@ class Placement:
         for stretch in _stretches(self._views, ~self.known):
             if len(stretch) < len(everything):
                 self._find_again(stretch)
+        self.mend()
 
     def _find_again(self, stretch: NDArray[np.int64]) -> None:
         """Seek the pose in a stretch where it has been lost."""
@@ -148,6 +152,33 @@ class Placement:
         self._spread(view, likely[0].start, stretch)
         return True
 
+    def mend(self) -> None:
+        """Where odometry cannot have led from one known view to the next, follow across.
+
+        One of two such pieces is in the wrong place, unless someone carried the robot. Each is
+        followed through the other, and takes its views if they match about as well from there.
+        """
+        tried: set[int] = set()
+        for _ in range(MOST_MENDED):
+            tears = _tears(self._views, self.pose, self.known)
+            untried = [number for number, (before, _) in enumerate(tears) if before not in tried]
+            if not untried:
+                return
+            number = untried[0]
+            before, after = tears[number]
+            tried.add(before)
+            begin = tears[number - 1][1] if number > 0 else 0
+            end = tears[number + 1][0] if number + 1 < len(tears) else len(self._views) - 1
+            orders = (np.arange(before, end + 1), np.arange(begin, after + 1)[::-1])
+            tracks = [self._follower.followed(order, self.pose[order[0]]) for order in orders]
+            gains = [
+                track.support - (self.matched - self.beyond)[order]
+                for order, track in zip(orders, tracks, strict=True)
+            ]
+            best = max((0, 1), key=lambda side: float(gains[side].sum()))
+            if gains[best].mean() >= -LEAST_GAP:
+                self._put(orders[best], tracks[best])
+
     def _is_proved(self, followed: Followed, needed: float) -> bool:
         first = slice(0, FIRST_SPAN)
         matched, beyond = followed.track.matched[first], followed.track.beyond[first]
@@ -160,9 +191,13 @@ class Placement:
 
     def _take(self, order: NDArray[np.int64], track: Track) -> None:
         better = track.support > (self.matched - self.beyond)[order]
-        chosen = order[better]
-        self.pose[chosen] = track.pose[better]
-        self.matched[chosen], self.beyond[chosen] = track.matched[better], track.beyond[better]
+        self._put(order[better], track, better)
+
+    def _put(
+        self, views: NDArray[np.int64], track: Track, of_track: NDArray[np.bool_] | slice = ALL
+    ) -> None:
+        self.pose[views] = track.pose[of_track]
+        self.matched[views], self.beyond[views] = track.matched[of_track], track.beyond[of_track]
 
     def _remark(self) -> None:
         self._losses.remark(
@@ -191,6 +226,20 @@ def _stretches(views: Views, lost: NDArray[np.bool_]) -> Iterator[NDArray[np.int
         took_s = (views.time_ns[end - 1] - views.time_ns[begin]) * 1e-9
         if way_m >= LOST_M or took_s >= LOST_S:
             yield np.arange(begin, end)
+
+
+def _tears(views: Views, pose: FloatArray, known: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Pairs of known views with little way between, in order, that odometry cannot have joined."""
+    index = np.flatnonzero(known)
+    reach = np.searchsorted(views.driven_m[index], views.driven_m[index] + ELSEWHERE_WAY_M, "right")
+    last = index[reach - 1]
+    torn = [
+        not leads_to(views, before, pose[before], after, pose[after])
+        for before, after in zip(index.tolist(), last.tolist(), strict=True)
+    ]
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], torn, [False]]).astype(np.int8)))
+    middle = edges.reshape(-1, 2).sum(axis=1) // 2  # the jump is in the middle of these
+    return [(int(index[at]), int(last[at])) for at in middle]
 
 
 def _search_places(views: Views, stretch: NDArray[np.int64]) -> list[int]:
