@@ -40,7 +40,7 @@ def test_a_disk_that_is_full_at_any_output_leaves_nothing_behind(tmp_path):
     assert len(written) > 8
     for size in written:
         with (
-            files_no_larger_than(size - 1),
+            files_no_larger_than(size - 10),  # digits of the times in a report come and go
             pytest.raises(OutputError, match="cut: cannot be written"),
             new_folder(tmp_path / "cut", force=False) as folder,
         ):
