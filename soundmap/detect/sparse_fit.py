@@ -366,6 +366,7 @@ class SparseFit:
         if not owners:
             return np.zeros((0, 0)), np.zeros(0), owners
         own = np.stack(columns)
+        columns.clear()  # they are large
         weighted = self.precision.times(own)
         hessian = self._bordered(own, weighted)
         gradient = np.zeros(len(hessian))
