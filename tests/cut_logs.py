@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
-import numpy as np
 from logwriter import LogWriter
+from mcap.exceptions import McapError
 from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import StreamReader
 
@@ -14,8 +15,23 @@ from soundmap.errors import SoundmapError
 from soundmap.logs.log_files import log_files
 from soundmap.logs.reader import McapLog
 from soundmap.losses import LossLedger
+from soundmap.outputs.new_folder import new_folder
+from soundmap.outputs.picture_format import PictureFormat
 from soundmap.outputs.progress import chosen_progress
+from soundmap.outputs.run_folder import write_run
 from soundmap.replay import process
+
+
+def whole_messages(path: Path) -> int:
+    """How many messages the official reader gets out of a log before it gives up."""
+    count = 0
+    with path.open("rb") as stream:
+        try:
+            for record in StreamReader(stream).records:
+                count += isinstance(record, Message)
+        except (McapError, struct.error):
+            return count
+    return count
 
 
 def ended_properly(src: Path, dst: Path, count: int) -> None:
@@ -44,15 +60,29 @@ def ended_properly(src: Path, dst: Path, count: int) -> None:
                 )
 
 
-def outcome(path: Path, map_path: Path | None, config: Config, **options: object) -> object:
-    """Sources and trajectory of a log, or why there are none; and what was lost."""
+RESULTS = ("sources.csv", "trajectory.tum", "audio_scans.npz")
+
+
+def outcome(
+    path: Path, map_path: Path | None, config: Config, **options: object
+) -> dict[str, bytes] | str:
+    """What is found in a log, written beside it, or why there is nothing."""
     try:
         progress = chosen_progress(quiet=True)
         run = process(path, map_path, config, progress=progress, **options)  # type: ignore[arg-type]
     except SoundmapError as error:
-        return type(error).__name__, str(error).partition(": ")[2]
-    poses = np.column_stack([run.trajectory.time_ns, run.trajectory.pose])
-    return run.sources, poses.tobytes()
+        return f"{type(error).__name__}: {str(error).partition(': ')[2]}"
+    with new_folder(path.parent / "out", force=True) as folder:
+        write_run(run, folder, figures=PictureFormat.NONE)
+    return {name: (path.parent / "out" / name).read_bytes() for name in RESULTS}
+
+
+def differing(a: dict[str, bytes] | str, b: dict[str, bytes] | str) -> str:
+    """In what two outcomes differ."""
+    if isinstance(a, str) or isinstance(b, str):
+        words = [outcome if isinstance(outcome, str) else "results" for outcome in (a, b)]
+        return f"{words[0]} against {words[1]}"
+    return ", ".join(name for name in RESULTS if a[name] != b[name])
 
 
 def difference(
@@ -69,10 +99,13 @@ def difference(
         found = sum(1 for _ in McapLog(cut, log_files(cut), losses).messages())
     except SoundmapError:
         return None
+    whole = whole_messages(cut)
+    if found != whole:
+        return f"cut after {cut_bytes} bytes: {found} messages read of {whole} that are whole"
     if cut_bytes < src.stat().st_size and not losses.data_lost:
         return f"cut after {cut_bytes} bytes: nothing is said"
-    ended_properly(src, proper, found)
+    ended_properly(src, proper, whole)
     results = [outcome(path, map_path, config, **options) for path in (cut, proper)]
     if results[0] == results[1]:
         return None
-    return f"cut after {cut_bytes} bytes, {found} messages: {results[0]} against {results[1]}"
+    return f"cut after {cut_bytes} bytes, {whole} messages: {differing(*results)}"

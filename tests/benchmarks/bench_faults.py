@@ -1,4 +1,4 @@
-"""Thousands of damaged logs, a log cut short at many places, killed runs: what becomes of them.
+"""Thousands of damaged logs, and a log cut short at many places: what becomes of them.
 
 Each part prints one line of figures, and what went wrong above it; the exit code is 1 if anything
 did.
@@ -7,16 +7,14 @@ did.
 from __future__ import annotations
 
 import argparse
-import os
 import resource
-import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
 import traceback
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -37,8 +35,17 @@ class TooLongError(Exception):
 
 
 def damaged_logs(count: int, folder: Path) -> tuple[str, list[str]]:
-    """Every seed's log read; memory is the peak of the whole process."""
-    logs = fuzzing.Fuzzing(folder)
+    """Every seed's log read."""
+    return complaints(count, fuzzing.Fuzzing(folder).complaints)
+
+
+def damaged_runs(count: int, folder: Path) -> tuple[str, list[str]]:
+    """Every seed's log processed, from the command line to the files."""
+    return complaints(count, fuzzing.FuzzedRuns(folder).complaints)
+
+
+def complaints(count: int, of_seed: Callable[[int], list[str]]) -> tuple[str, list[str]]:
+    """What is wrong with each seed's log; memory is the peak of the whole process."""
     wrong: list[str] = []
     slowest = 0.0
 
@@ -50,7 +57,7 @@ def damaged_logs(count: int, folder: Path) -> tuple[str, list[str]]:
         began = time.process_time()
         signal.alarm(HANG_S)
         try:
-            wrong += logs.complaints(seed)
+            wrong += of_seed(seed)
         except Exception:
             wrong.append(f"seed {seed}:\n{traceback.format_exc(limit=-4)}")
         finally:
@@ -71,79 +78,45 @@ def site_in(folder: Path) -> tuple[Path, Path, Path]:
     return log, folder / "map.yaml", folder / "robot.toml"
 
 
-def cut_log(count: int, folder: Path) -> tuple[str, list[str]]:
+def cut_log(count: int, folder: Path, site: Path | None = None) -> tuple[str, list[str]]:
     """A log cut at places spread over its bytes, against the same log ended properly there."""
-    log, map_path, robot = site_in(folder)
+    if site is None:
+        log, map_path, robot = site_in(folder)
+        start: dict[str, object] = {"start_pose": small_logs.START}
+    else:
+        log, start = folder / "run1.mcap", {}
+        log.symlink_to((site / log.name).resolve())
+        map_path, robot = site / "map.yaml", site / "robot.toml"
     config, size = loaded_config([robot]), log.stat().st_size
     places = [round(size * (place + 0.5) / count) for place in range(count)]
-    found = [
-        cut_logs.difference(log, place, map_path, config, start_pose=small_logs.START)
-        for place in places
-    ]
+    found = [cut_logs.difference(log, place, map_path, config, **start) for place in places]
     return f"{count} cuts of {size / 1e6:.1f} MB", [wrong for wrong in found if wrong]
 
 
-def killed_runs(count: int, folder: Path) -> tuple[str, list[str]]:
-    """A run killed at moments spread over its time; then one that must complete."""
-    log, map_path, robot = site_in(folder)
-    out = folder / "out"
-    command = [sys.executable, "-c", "from soundmap.cli import main; main()", "process", str(log)]
-    command += ["--map", str(map_path), "--config", str(robot), "--start-pose", "1,1,0"]
-    command += ["--out", str(out), "--quiet"]
-    os.environ["XDG_CACHE_HOME"] = str(folder / "cache")
-
-    def run(kill_after_s: float | None) -> float:
-        began = time.monotonic()
-        running = subprocess.Popen(command)
-        try:
-            code = running.wait(kill_after_s)
-        except subprocess.TimeoutExpired:
-            running.kill()
-            code = running.wait()
-        return time.monotonic() - began if code == 0 else -1.0
-
-    run(None)  # compiles kernels
-    names = sorted(path.name for path in out.iterdir())
-    shutil.rmtree(out)
-    shutil.rmtree(folder / "cache")
-    whole_s = run(None)
-    wrong, killed = list[str](), 0
-    for moment in range(count):
-        shutil.rmtree(out, ignore_errors=True)
-        shutil.rmtree(folder / "cache", ignore_errors=True)
-        if run(whole_s * (moment + 0.5) / count) > 0:
-            continue  # it was faster this time
-        killed += 1
-        if out.exists():  # right only if all was done, and the process killed while it ended
-            if sorted(path.name for path in out.iterdir()) != names:
-                wrong.append(f"killed at moment {moment}: a folder that looks finished")
-            shutil.rmtree(out)
-        if run(None) < 0 or not (out / "report.json").is_file():
-            wrong.append(f"killed at moment {moment}: the next run does not complete")
-        left = [path.name for path in folder.iterdir() if path.name.startswith(".")]
-        if left:
-            wrong.append(f"killed at moment {moment}: {left} left behind")
-    return f"{killed} runs of {whole_s:.1f} s killed", wrong
-
-
-PARTS: dict[str, Callable[[int, Path], tuple[str, list[str]]]] = {
-    "damaged": damaged_logs,
-    "cut": cut_log,
-    "killed": killed_runs,
-}
-COUNTS = {"damaged": 5000, "cut": 50, "killed": 25}
+COUNTS = {"damaged": 5000, "processed": 300, "cut": 50}
 
 
 def main() -> int:
     """Run the parts asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--part", choices=[*PARTS], action="append", help="default: all")
+    parser.add_argument("--part", choices=[*COUNTS], action="append", help="default: all")
     parser.add_argument("--count", type=int, help="how many, instead of the number that is usual")
+    parser.add_argument(
+        "--site",
+        type=Path,
+        help="folder with the run1.mcap to be cut, its map.yaml and robot.toml, instead of a short "
+        "drive made for it",
+    )
     options = parser.parse_args()
+    parts: dict[str, Callable[[int, Path], tuple[str, list[str]]]] = {
+        "damaged": damaged_logs,
+        "processed": damaged_runs,
+        "cut": partial(cut_log, site=options.site),
+    }
     failed = False
-    for part in options.part or PARTS:
+    for part in options.part or parts:
         with tempfile.TemporaryDirectory() as folder:
-            figures, wrong = PARTS[part](options.count or COUNTS[part], Path(folder))
+            figures, wrong = parts[part](options.count or COUNTS[part], Path(folder))
         print(*wrong, f"{part}: {figures}, {len(wrong)} wrong", sep="\n", flush=True)
         failed |= bool(wrong)
     return int(failed)
