@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from typing import NamedTuple
 
 from logwriter import LogWriter
 from mcap.exceptions import McapError
@@ -15,6 +16,7 @@ from soundmap.errors import SoundmapError
 from soundmap.logs.log_files import log_files
 from soundmap.logs.reader import McapLog
 from soundmap.losses import LossLedger
+from soundmap.outputs.illustrator import Illustrator
 from soundmap.outputs.new_folder import new_folder
 from soundmap.outputs.picture_format import PictureFormat
 from soundmap.outputs.progress import chosen_progress
@@ -71,9 +73,11 @@ def outcome(
         progress = chosen_progress(quiet=True)
         run = process(path, map_path, config, progress=progress, **options)  # type: ignore[arg-type]
     except SoundmapError as error:
-        return f"{type(error).__name__}: {str(error).partition(': ')[2]}"
+        # A log that ended on purpose has lost nothing, and its name is another.
+        told = str(error).partition(": ")[2].partition(" Lost before that: ")[0]
+        return f"{type(error).__name__}: {told}"
     with new_folder(path.parent / "out", force=True) as folder:
-        write_run(run, folder, figures=PictureFormat.NONE)
+        write_run(run, folder, Illustrator(PictureFormat.NONE))
     return {name: (path.parent / "out" / name).read_bytes() for name in RESULTS}
 
 
@@ -85,10 +89,21 @@ def differing(a: dict[str, bytes] | str, b: dict[str, bytes] | str) -> str:
     return ", ".join(name for name in RESULTS if a[name] != b[name])
 
 
-def difference(
+class Compared(NamedTuple):
+    """A cut log beside the one that was ended properly there.
+
+    ``wrong`` is what is wrong with its results, None if nothing is; ``usable`` whether there are
+    any.
+    """
+
+    wrong: str | None
+    usable: bool = False
+
+
+def compared(
     src: Path, cut_bytes: int, map_path: Path | None, config: Config, **options: object
-) -> str | None:
-    """What is wrong with the results of a log cut after so many bytes; None if nothing is."""
+) -> Compared:
+    """What becomes of a log cut after so many bytes."""
     folders = [src.parent / "cut", src.parent / "proper"]
     for folder in folders:
         folder.mkdir(exist_ok=True)
@@ -98,14 +113,13 @@ def difference(
     try:
         found = sum(1 for _ in McapLog(cut, log_files(cut), losses).messages())
     except SoundmapError:
-        return None
+        return Compared(None)
     whole = whole_messages(cut)
     if found != whole:
-        return f"cut after {cut_bytes} bytes: {found} messages read of {whole} that are whole"
+        return Compared(f"cut after {cut_bytes} bytes: {found} messages read of {whole} whole ones")
     if cut_bytes < src.stat().st_size and not losses.data_lost:
-        return f"cut after {cut_bytes} bytes: nothing is said"
+        return Compared(f"cut after {cut_bytes} bytes: nothing is said")
     ended_properly(src, proper, whole)
     results = [outcome(path, map_path, config, **options) for path in (cut, proper)]
-    if results[0] == results[1]:
-        return None
-    return f"cut after {cut_bytes} bytes, {whole} messages: {differing(*results)}"
+    wrong = f"cut after {cut_bytes} bytes, {whole} messages: {differing(*results)}"
+    return Compared(wrong if results[0] != results[1] else None, not isinstance(results[0], str))

@@ -23,11 +23,11 @@ def site(tmp_path_factory):
 def test_a_log_cut_anywhere_gives_the_results_of_its_whole_part(site, share):
     log = site / "run.mcap"
     config = loaded_config([site / "robot.toml"])
-    wrong = cut_logs.difference(
+    found = cut_logs.compared(
         log,
         int(share * log.stat().st_size),
         site / "map.yaml",
         config,
         start_pose=small_logs.START,
     )
-    assert wrong is None
+    assert found.wrong is None

@@ -89,8 +89,10 @@ def cut_log(count: int, folder: Path, site: Path | None = None) -> tuple[str, li
         map_path, robot = site / "map.yaml", site / "robot.toml"
     config, size = loaded_config([robot]), log.stat().st_size
     places = [round(size * (place + 0.5) / count) for place in range(count)]
-    found = [cut_logs.difference(log, place, map_path, config, **start) for place in places]
-    return f"{count} cuts of {size / 1e6:.1f} MB", [wrong for wrong in found if wrong]
+    found = [cut_logs.compared(log, place, map_path, config, **start) for place in places]
+    usable = sum(one.usable for one in found)
+    wrong = [one.wrong for one in found if one.wrong]
+    return f"{count} cuts of {size / 1e6:.1f} MB, {usable} of them with results", wrong
 
 
 COUNTS = {"damaged": 5000, "processed": 300, "cut": 50}
