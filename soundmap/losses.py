@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
+
+from soundmap.errors import SoundmapError
 
 
 @dataclass(frozen=True)
@@ -92,6 +95,18 @@ class LossLedger:
 
     def __len__(self) -> int:
         return len(self._losses)
+
+    @contextmanager
+    def told_with_errors(self) -> Iterator[None]:
+        """Lets an error that ends the work also tell what was lost before it."""
+        try:
+            yield
+        except SoundmapError as error:
+            lost = [loss for loss in self if loss.data_lost]
+            if lost:
+                named = "; ".join(f"{loss.count} x {loss.what} ({loss.where})" for loss in lost[:3])
+                error.args = (f"{error} Lost before that: {named}{'; more' * (len(lost) > 3)}.",)
+            raise
 
     @property
     def data_lost(self) -> bool:

@@ -172,6 +172,17 @@ def _measured(
     """One pass over the log: audio scans and surroundings; and the trajectory in the map."""
     with clock.stage("read"):
         log = open_log(log_path, config)
+    with log.losses.told_with_errors():
+        return _measured_of(log, given, config, start_pose, clock)
+
+
+def _measured_of(
+    log: RobotLog,
+    given: OccupancyGrid | None,
+    config: Config,
+    start_pose: tuple[float, float, float] | None,
+    clock: _Stopwatch,
+) -> Measured:
     array = log.array
     if array is None:
         raise ValueError("the log was opened without audio")
@@ -197,7 +208,7 @@ def _measured(
         )
     if not len(scans):
         raise NothingUsableError(
-            f"{log_path}: the audio is too short or too broken for one audio scan of "
+            f"{log.path}: the audio is too short or too broken for one audio scan of "
             f"{config.scan.frames} windows."
         )
     surroundings = gatherer.gathered()

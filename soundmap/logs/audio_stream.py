@@ -261,13 +261,13 @@ def _array_mount(config: Config, stream: AudioStream, mounts: Mounts, log_name: 
                 f"{log_name}: [array] frame = {frame!r} is not in the log. Frames known: "
                 f"{', '.join(mounts.tree.frames) or 'none'}.{hint} {advice}"
             )
-        return found
+        return mounts.credible(found, frame)
     record = stream.topic.record
     own = record.frame_ids.most_common(1)[0][0] if isinstance(record, AudioRecord) else ""
     for frame in (own, "mic_array"):
         found = mounts.get(frame) if frame else None
         if found is not None:
-            return found
+            return mounts.credible(found, frame)
     known = ", ".join(mounts.tree.frames) or "none"
     told = f"its audio names {own!r}" if own else "its audio names no frame"
     raise ConfigError(

@@ -36,7 +36,7 @@ class Stream(Protocol):
 
 def count_silences(streams: Iterable[Stream], losses: LossLedger) -> None:
     """Count stretches of a log in which one of its sensors says nothing."""
-    heard = [stream for stream in streams if len(stream.logged_ns) > 1]
+    heard = [stream for stream in streams if len(stream.logged_ns)]
     if not heard:
         return
     start = min(int(stream.logged_ns[0]) for stream in heard)
@@ -82,5 +82,5 @@ def _count_gaps(topic: str, times: NDArray[np.int64], losses: LossLedger) -> Non
 
 
 def _period_s(times: NDArray[np.int64]) -> float:
-    """Period of a stream, or a long one of a stream that has none."""
-    return float(np.quantile(np.diff(times), 0.95)) * 1e-9
+    """Period of a stream, or a long one of a stream that has none; nought of a single message."""
+    return float(np.quantile(np.diff(times), 0.95)) * 1e-9 if len(times) > 1 else 0.0

@@ -6,9 +6,17 @@ import difflib
 from collections import deque
 from collections.abc import Iterable, Mapping
 
+import numpy as np
+
 from soundmap.config import PlanarMount
 from soundmap.errors import ConfigError
 from soundmap.geometry import Mount
+
+MAX_MOUNT_M = 100.0
+"""No sensor is farther than this from the base of its robot."""
+
+SAME_M = 0.005
+"""Two accounts of where a frame is agree if they differ by no more, also 1 m from it."""
 
 
 class FrameTree:
@@ -21,6 +29,7 @@ class FrameTree:
     """
 
     def __init__(self, edges: Mapping[tuple[str, str], Mount]) -> None:
+        self._edges = dict(edges)
         self._neighbours: dict[str, dict[str, Mount]] = {}
         self._parents: dict[str, str] = {}
         for (parent, child), mount in edges.items():
@@ -48,6 +57,19 @@ class FrameTree:
     def roots(self) -> tuple[str, ...]:
         """The frames without a parent, in alphabetical order."""
         return tuple(sorted({self.root(frame) for frame in self._neighbours}))
+
+    @property
+    def contradictions(self) -> tuple[tuple[str, str], ...]:
+        """Transforms, parent and child, that do not fit what the others say."""
+        found = []
+        for (parent, child), told in self._edges.items():
+            used = self.mount(parent, child)
+            if used is None:
+                continue
+            off_m = np.linalg.norm(used.translation_m - told.translation_m)
+            if max(off_m, np.abs(used.rotation - told.rotation).max()) > SAME_M:
+                found.append((parent, child))
+        return tuple(found)
 
     def mount(self, base: str, frame: str) -> Mount | None:
         """Where ``frame`` is in the frame ``base``; None if no chain leads there."""
@@ -105,7 +127,24 @@ class Mounts:
         found = self.get(frame)
         if found is None:
             raise ConfigError(self.missing(frame, user))
-        return found
+        return self.credible(found, frame)
+
+    def credible(self, mount: Mount, frame: str) -> Mount:
+        """The mount of a frame, if it can be one.
+
+        Raises
+        ------
+        ConfigError
+            It is not on the robot.
+        """
+        away_m = float(np.linalg.norm(mount.translation_m))
+        if away_m > MAX_MOUNT_M:
+            raise ConfigError(
+                f"{self._log_name}: frame {frame!r} is {away_m:.3g} m away from the base frame "
+                f"{self.base!r}, expected at most {MAX_MOUNT_M:.0f} m. Give its mount in the "
+                f'configuration: [mounts] "{frame}" = [x, y, z, yaw_rad].'
+            )
+        return mount
 
     def missing(self, frame: str, user: str) -> str:
         """What to tell about a frame whose mount is unknown."""

@@ -210,6 +210,11 @@ def open_log(path: Path, config: Config, *, need_audio: bool = True) -> RobotLog
         The configuration does not fit it, or has to settle something.
     """
     losses = LossLedger()
+    with losses.told_with_errors():
+        return _opened(path, config, losses, need_audio=need_audio)
+
+
+def _opened(path: Path, config: Config, losses: LossLedger, *, need_audio: bool) -> RobotLog:
     log = McapLog(path, log_files(path), losses)
     survey = Survey(log, need_audio=need_audio)
     name = str(path)

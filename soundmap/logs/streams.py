@@ -25,7 +25,7 @@ class OdometryStream:
     """The base in the odometry frame, and where that comes from.
 
     ``source`` is "pose", "twist" or "transform"; ``ahead_ns`` how far the stamps are ahead of the
-    log's own time.
+    log's own time; ``span_ns`` when the first and the last message were logged.
     """
 
     topic: str
@@ -34,6 +34,7 @@ class OdometryStream:
     parent: str
     child: str
     ahead_ns: int
+    span_ns: tuple[int, int]
     counts_gaps = False
 
     @property
@@ -43,8 +44,8 @@ class OdometryStream:
 
     @property
     def logged_ns(self) -> Times:
-        """When the sound messages were logged, shape (K,), rising."""
-        return self.trajectory.time_ns - self.ahead_ns
+        """When the sound messages were logged but for their delays, shape (K,), rising."""
+        return np.clip(self.trajectory.time_ns - self.ahead_ns, *self.span_ns)
 
 
 @dataclass(frozen=True)
@@ -111,7 +112,8 @@ def odometry_stream(
             f"{len(trajectory)} of them sound. Check the robot's odometry."
         )
     source = "transform" if topic is None else source
-    return OdometryStream(name, trajectory, source, record.parent, record.child, ahead_ns)
+    span_ns = min(record.log_time_ns), max(record.log_time_ns)
+    return OdometryStream(name, trajectory, source, record.parent, record.child, ahead_ns, span_ns)
 
 
 def _moving_transform(survey: Survey, config: Config, log_name: str) -> tuple[str, OdometryRecord]:
@@ -164,6 +166,7 @@ def base_mounts(
         if names != (odometry.parent, odometry.child)
     }
     tree = FrameTree(fixed)
+    _count_bad_transforms(survey, tree, (odometry.parent, odometry.child), losses)
     base = odometry.child
     if fixed and base not in tree:
         roots = [root for root in tree.roots if root != odometry.parent]
@@ -175,6 +178,34 @@ def base_mounts(
             )
             base = roots[0]
     return Mounts(tree, base, config.mounts, log_name)
+
+
+def _count_bad_transforms(
+    survey: Survey, tree: FrameTree, driven: tuple[str, str], losses: LossLedger
+) -> None:
+    """Count what was said of the robot's frames and cannot be right."""
+    for (parent, child), edge in survey.transforms.edges.items():
+        if (parent, child) == driven:
+            continue  # is odometry, and judged as such
+        losses.add(
+            f"transform from {parent!r} to {child!r} is not finite",
+            edge.topic,
+            count=edge.not_finite,
+            effect="left out",
+        )
+        losses.add(
+            f"mount of {child!r} in {parent!r} is told anew, and otherwise",
+            edge.topic,
+            count=len(edge.changed_ns),
+            effect="the latest counts, for the whole log",
+            time_ns=edge.changed_ns,
+        )
+    for parent, child in tree.contradictions:
+        losses.add(
+            f"transform from {parent!r} to {child!r} contradicts others",
+            survey.transforms.edges[parent, child].topic,
+            effect="not used: check where the sensors are said to be",
+        )
 
 
 def laser_streams(

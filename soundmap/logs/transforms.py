@@ -68,6 +68,10 @@ class Edge:
         Sound ones.
     moves : bool
         Whether they vary.
+    not_finite : int
+        Others.
+    changed_ns : list of int
+        When a static topic told otherwise than before [ns since epoch].
     topic : str
         Where the first came from.
     record : OdometryRecord
@@ -78,6 +82,8 @@ class Edge:
     first: tuple[float, ...] = ()
     count: int = 0
     moves: bool = False
+    not_finite: int = 0
+    changed_ns: list[int] = field(default_factory=list)
     static: bool = False
     record: OdometryRecord = field(default_factory=OdometryRecord)
 
@@ -87,7 +93,6 @@ class TransformRecord:
 
     def __init__(self) -> None:
         self.edges: dict[tuple[str, str], Edge] = {}
-        self.not_finite: dict[str, int] = {}
 
     def add(
         self, topic: str, transforms: Iterator[Transform], log_time_ns: int, *, static: bool
@@ -99,15 +104,15 @@ class TransformRecord:
                 edge.record.parent, edge.record.child = parent, child
                 edge.record.add_transform(stamp_ns, log_time_ns, pose)
             if not _sound(pose):
-                self.not_finite[topic] = self.not_finite.get(topic, 0) + 1
+                edge.not_finite += 1
                 continue
             if static or not edge.count:
+                if edge.count and _differ(pose, edge.first):
+                    edge.changed_ns.append(log_time_ns)
                 edge.first = pose
                 edge.static |= static
             elif not edge.moves:
-                edge.moves = any(
-                    abs(a - b) > STILL_M for a, b in zip(pose, edge.first, strict=True)
-                )
+                edge.moves = _differ(pose, edge.first)
             edge.count += 1
 
     def fixed(self) -> dict[tuple[str, str], Mount]:
@@ -121,6 +126,10 @@ class TransformRecord:
     def moving(self) -> dict[tuple[str, str], Edge]:
         """Transforms that vary."""
         return {n: e for n, e in self.edges.items() if e.count and e.moves and not e.static}
+
+
+def _differ(a: tuple[float, ...], b: tuple[float, ...]) -> bool:
+    return any(abs(x - y) > STILL_M for x, y in zip(a, b, strict=True))
 
 
 def _sound(pose: tuple[float, ...]) -> bool:
