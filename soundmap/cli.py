@@ -6,6 +6,8 @@ import os
 import signal
 import sys
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -47,16 +49,31 @@ input, 4 nothing usable in the log, 5 --strict and data was lost.
 class Commands(TyperGroup):
     """All commands, with the one place where the errors that a user can mend are caught."""
 
+    def make_context(self, *args: Any, **keywords: Any) -> Any:
+        """Parse what was asked for."""
+        with _clear_endings():
+            return super().make_context(*args, **keywords)
+
     def invoke(self, ctx: Any) -> Any:
         """Run the command that was asked for."""
-        try:
+        with _clear_endings():
             return super().invoke(ctx)
-        except SoundmapError as error:
-            show_error(error)
-            raise typer.Exit(error.exit_code) from None
-        except KeyboardInterrupt:
-            print("soundmap: stopped; nothing was left half written.", file=sys.stderr)
-            raise typer.Exit(130) from None
+
+
+@contextmanager
+def _clear_endings() -> Iterator[None]:
+    """What a user can mend, or wants, ends the program with a line of text and no traceback."""
+    try:
+        yield
+    except SoundmapError as error:
+        show_error(error)
+        raise typer.Exit(error.exit_code) from None
+    except MemoryError as error:
+        show_error(SoundmapError(f"memory ran out ({error or 'no more is known'})."))
+        raise typer.Exit(SoundmapError.exit_code) from None
+    except KeyboardInterrupt:
+        print("soundmap: stopped; nothing was left half written.", file=sys.stderr)
+        raise typer.Exit(130) from None
 
 
 app = typer.Typer(
@@ -273,7 +290,10 @@ def main() -> None:
         os.environ["NUMBA_CACHE_DIR"] = str(folder)
     signal.signal(signal.SIGTERM, _stop)
     hush_libraries()
-    app(prog_name="soundmap")
+    try:
+        app(prog_name="soundmap")
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is done: there is nothing to stop
 
 
 def _stop(number: int, _frame: object) -> None:

@@ -22,9 +22,14 @@ from soundmap.geometry import FloatArray
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
-Count = Annotated[int, Field(ge=1)]
-Vector3 = tuple[float, float, float]
-PlanarMount = tuple[float, float, float, float]
+OnArray = Annotated[float, Field(ge=-10, le=10)]
+OnRobot = Annotated[float, Field(ge=-100, le=100)]
+Cell = Annotated[float, Field(ge=0.002, le=10)]
+Vector3 = tuple[OnArray, OnArray, OnArray]
+PlanarMount = tuple[OnRobot, OnRobot, OnRobot, OnRobot]
+
+ON_ONE_LINE_M = 1e-3
+"""Microphones that are nowhere farther than this from a line cannot tell its two sides apart."""
 
 
 class Table(BaseModel):
@@ -43,15 +48,15 @@ class ArrayConfig(Table):
     """x, y, z [m] and yaw [rad] in the base frame, instead of the looked-up one."""
     kind: Literal["circle"] | None = None
     """Equally spaced microphones, counter-clockwise. The default if no positions are given."""
-    microphones: Count | None = None
+    microphones: Annotated[int, Field(ge=1, le=1024)] | None = None
     """Microphones on the circle (16 if left out)."""
-    radius_m: Positive | None = None
+    radius_m: Annotated[float, Field(gt=0, le=10)] | None = None
     """Radius of the circle (0.155 if left out) [m]."""
     first_angle_rad: float | None = None
     """Bearing of the first microphone (0 if left out) [rad]."""
     positions_m: tuple[Vector3, ...] | None = None
     """One row a microphone in channel order, in the array's frame [m]."""
-    pascal_per_count: Positive | None = None
+    pascal_per_count: Annotated[float, Field(ge=1e-12, le=1e6)] | None = None
     """Sound pressure of one unit of the recorded samples [Pa]; without it levels are relative."""
 
     @model_validator(mode="after")
@@ -63,6 +68,11 @@ class ArrayConfig(Table):
             raise ValueError("positions_m needs at least 3 microphones to tell bearings apart")
         if self.microphones is not None and self.microphones < 3:
             raise ValueError("a circle needs at least 3 microphones to tell bearings apart")
+        if _off_line_m(self.microphone_positions()[:, :2]) < ON_ONE_LINE_M:
+            raise ValueError(
+                "the microphones stand on one line, or in one place, as seen from above: they "
+                "cannot tell its two sides apart"
+            )
         return self
 
     def microphone_positions(self) -> FloatArray:
@@ -73,6 +83,13 @@ class ArrayConfig(Table):
         radius = self.radius_m or 0.155
         angle = (self.first_angle_rad or 0.0) + 2.0 * np.pi * np.arange(count) / count
         return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(count)], axis=-1)
+
+
+def _off_line_m(planar: FloatArray) -> float:
+    """How far points, shape (Q, 2), are from the line that fits them best, at most [m]."""
+    centred = planar - planar.mean(axis=0)
+    normal = np.linalg.svd(centred, full_matrices=False)[2][-1]
+    return float(np.abs(centred @ normal).max())
 
 
 class TopicsConfig(Table):
@@ -93,19 +110,19 @@ class AudioConfig(Table):
 class MappingConfig(Table):
     """Map building, Sect. 2.1."""
 
-    key_distance_m: Positive = 0.20
+    key_distance_m: Annotated[float, Field(ge=0.01)] = 0.20
     """The map is made of key scans: one each time a scanner has moved this far [m] ..."""
-    key_angle_rad: Positive = math.radians(10.0)
+    key_angle_rad: Annotated[float, Field(ge=0.01)] = math.radians(10.0)
     """... or turned this far [rad]."""
-    returns: Annotated[int, Field(ge=50)] = 300
+    returns: Annotated[int, Field(ge=50, le=100_000)] = 300
     """Returns kept of a key scan ..."""
     return_spacing_m: Positive = 0.05
     """... and their least distance from each other [m]."""
-    neighbours: Annotated[int, Field(ge=4)] = 14
+    neighbours: Annotated[int, Field(ge=4, le=1000)] = 14
     """Scans that each key scan is laid on."""
     loop_window_m: Positive = 6.0
     """Greatest drift within which a place seen before is searched for [m]."""
-    cell_m: Positive = 0.05
+    cell_m: Cell = 0.05
     """Edge of a cell of the map [m]."""
     occupied_share: Annotated[float, Field(gt=0, le=1)] = 0.35
     """A cell is occupied if at least this share of the rays that reach it end in it."""
@@ -122,9 +139,9 @@ class LocalizeConfig(Table):
 
     seed: Annotated[int, Field(ge=0)] = 1
     """Seed of the random numbers: the same log gives the same trajectory."""
-    particles: Count = 300
+    particles: Annotated[int, Field(ge=1, le=1_000_000)] = 300
     """:math:`M`, particles."""
-    beams: Count = 60
+    beams: Annotated[int, Field(ge=1, le=100_000)] = 60
     """Rays used of each laser scan, spread evenly over its valid ones."""
     update_distance_m: NotNegative = 0.10
     """A laser scan is used once the robot has moved this far ..."""
@@ -175,19 +192,19 @@ SUB_BAND_SHARES = (0.0, 0.2, 0.4, 0.7, 1.0)
 class ScanConfig(Table):
     """Audio scanning, Sect. 2.3."""
 
-    window_s: Positive = 0.025
+    window_s: Annotated[float, Field(gt=0, le=1)] = 0.025
     """Analysis window of the short-time Fourier transform [s]."""
-    hop_s: Positive = 0.010
+    hop_s: Annotated[float, Field(ge=1e-4)] = 0.010
     """Shift of the window [s]."""
-    frames: Count = 10
+    frames: Annotated[int, Field(ge=1, le=10_000)] = 10
     """Windows averaged into one audio scan."""
     low_hz: Positive = 1000.0
     """Lower edge of the band [Hz]."""
     high_hz: Positive = 6000.0
     """Upper edge of the band [Hz]."""
-    bearings: Annotated[int, Field(ge=8)] = 120
+    bearings: Annotated[int, Field(ge=8, le=3600)] = 120
     """:math:`N`, equally spaced bearings of a scan; 120 makes Table 1's 3 degrees."""
-    speed_of_sound_m_s: Positive = 343.0
+    speed_of_sound_m_s: Annotated[float, Field(ge=100, le=10_000)] = 343.0
     """Speed of sound [m/s]; 343 at 20 degrees Celsius."""
 
     @model_validator(mode="after")
@@ -223,7 +240,7 @@ class FuseConfig(Table):
     """Which bearings of a scan may be its strongest candidate. "bearings": all, as in the paper;
     "peaks": only local maxima over the bearings, interpolated between them. Eq. (3) otherwise
     favours the flank of a peak that points past the source at a farther wall."""
-    cell_m: Positive = 0.05
+    cell_m: Cell = 0.05
     """Edge of a cell of the power map [m]."""
     alpha: NotNegative = 0.5
     """:math:`\\alpha` of Eq. (3): effect of the distance on the power."""

@@ -5,6 +5,7 @@ The image's first row is the top of the map; an `OccupancyGrid`'s first row is t
 
 from __future__ import annotations
 
+import math
 import reprlib
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,15 @@ FREE_PIXEL, OCCUPIED_PIXEL, UNKNOWN_PIXEL = 254, 0, 205
 OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196
 MAX_CELLS = 400_000_000
 """A map of 1 km x 1 km at 5 cm; anything larger is taken for a mistake."""
+
+MAX_ORIGIN_M = 1e7
+"""Coordinates of any grid on Earth lie within this."""
+
+_FORMATS = ("PPM", "PNG", "BMP", "TGA", "JPEG", "GIF", "TIFF")
+"""Of images that are only ever data: no others are tried, nor the programs that read them."""
+
+_MODES = ("trinary", "scale", "raw")
+_THRESHOLDS = {"free_thresh": FREE_THRESHOLD, "occupied_thresh": OCCUPIED_THRESHOLD}
 
 _SHORTENED = reprlib.Repr()
 _SHORTENED.maxlevel = 2  # YAML's aliases can multiply without end when they are written out
@@ -75,6 +85,7 @@ def _read_description(path: Path) -> dict[str, Any]:
 
     expected = "Expected a map_server YAML file with image, resolution and origin."
     try:
+        _refuse_what_is_no_file(path)
         found = YAML(typ="safe", pure=True).load(path.read_bytes())
     except OSError as error:
         raise MapError(f"{path}: the map cannot be read ({error.strerror}). {expected}") from None
@@ -87,21 +98,42 @@ def _read_description(path: Path) -> dict[str, Any]:
         raise MapError(f"{path}: {', '.join(missing)} missing. {expected}")
     numbers = found["origin"]
     try:
-        sound = len(numbers) == 3 and bool(np.all(np.isfinite([float(value) for value in numbers])))
+        x, y, yaw = (float(value) for value in numbers)
+        sound = max(abs(x), abs(y)) <= MAX_ORIGIN_M and abs(yaw) <= 2.0 * math.pi
         resolution = float(found["resolution"])
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         sound, resolution = False, 0.0
-    if not sound or not 0 < resolution < 10:
+    if not sound or isinstance(found["resolution"], bool) or not 1e-3 <= resolution < 10:
         raise MapError(
             f"{path}: resolution {_short(found['resolution'])}, origin {_short(numbers)}; "
-            "expected metres a cell, and x, y, yaw of the lower-left corner."
+            "expected metres a cell, and x, y [m], yaw [rad] of the lower-left corner."
         )
-    for key in {"occupied_thresh", "free_thresh"} & found.keys():
-        if not isinstance(found[key], int | float) or not 0 <= found[key] <= 1:
-            raise MapError(f"{path}: {key} {_short(found[key])}; expected a share from 0 to 1.")
+    _check_reading(path, found)
     if not isinstance(found["image"], str):
         raise MapError(f"{path}: image {_short(found['image'])}; expected the name of a file.")
     return found
+
+
+def _check_reading(path: Path, found: dict[str, Any]) -> None:
+    """Refuse settings that do not say which pixels are occupied and which are free."""
+    for key in {"occupied_thresh", "free_thresh"} & found.keys():
+        if not isinstance(found[key], int | float) or not 0 <= found[key] <= 1:
+            raise MapError(f"{path}: {key} {_short(found[key])}; expected a share from 0 to 1.")
+    low, high = (float(found.get(key, default)) for key, default in _THRESHOLDS.items())
+    if low > high:
+        raise MapError(
+            f"{path}: free_thresh {low} is above occupied_thresh {high}; pixels would be both."
+        )
+    if found.get("negate", 0) not in (0, 1):
+        raise MapError(f"{path}: negate {_short(found['negate'])}; expected 0 or 1.")
+    if found.get("mode", "trinary") not in _MODES:
+        raise MapError(f"{path}: mode {_short(found['mode'])}; expected {', '.join(_MODES)}.")
+
+
+def _refuse_what_is_no_file(path: Path) -> None:
+    """A pipe would be waited for without end."""
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise MapError(f"{path}: not a file.")
 
 
 def _read_image(path: Path, description: dict[str, Any]) -> NDArray[np.uint8]:
@@ -110,7 +142,8 @@ def _read_image(path: Path, description: dict[str, Any]) -> NDArray[np.uint8]:
 
     file = path.parent / description["image"]
     try:
-        with Image.open(file) as image:
+        _refuse_what_is_no_file(file)
+        with Image.open(file, formats=_FORMATS) as image:
             if image.width * image.height > MAX_CELLS:
                 raise MapError(f"{file}: {image.width} x {image.height} cells is too large a map.")
             grey = np.asarray(image.convert("L"))

@@ -12,6 +12,7 @@ import enum
 import hashlib
 import json
 import os
+import time
 import types
 import typing
 import zipfile
@@ -35,6 +36,9 @@ from soundmap.surroundings import Surroundings
 
 MAX_CACHE_BYTES = 2 * 2**30
 """What has not been used for longest is removed when the cache grows beyond this."""
+
+ABANDONED_S = 3600.0
+"""Nobody takes that long to write a file here."""
 
 _SLOW_STAGES = ("array", "topics", "mounts", "audio", "map", "localize", "scan")
 _UNREADABLE = (
@@ -169,6 +173,9 @@ class MeasuredCache:
 
     def _make_room(self) -> None:
         files = sorted(self.folder.glob("*.npz"), key=lambda file: -file.stat().st_mtime_ns)
+        for file in self.folder.glob(".*"):  # what killed runs left
+            if file.stat().st_mtime < time.time() - ABANDONED_S:
+                _removed(file)
         total = 0
         for file in files:
             total += file.stat().st_size

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -84,19 +85,35 @@ def print_result(
     else:
         from rich.console import Console
 
-        Console(highlight=False).print(view(content))
+        Console(highlight=False).print(view(_printable(content)))
+
+
+def _printable(content: Any) -> Any:
+    """A result whose texts a terminal can be given, at any depth."""
+    from soundmap.outputs.wording import printable
+
+    if isinstance(content, str):
+        return printable(content)
+    if isinstance(content, Mapping):
+        return {_printable(key): _printable(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_printable(value) for value in content]
+    return content
 
 
 def show_error(error: SoundmapError) -> None:
     """One panel on a terminal; plain, unbroken lines anywhere else."""
+    from soundmap.outputs.wording import printable
+
+    told = re.sub(r"\S{300,}", lambda word: f"{word[0][:200]}...", printable(str(error)))
     if not sys.stderr.isatty():
-        print(f"soundmap: error: {error}", file=sys.stderr)
+        print(f"soundmap: error: {told}", file=sys.stderr)
         return
     from rich.console import Console
     from rich.panel import Panel
     from rich.text import Text
 
-    panel = Panel(Text(str(error)), title="soundmap: error", border_style="red")
+    panel = Panel(Text(told), title="soundmap: error", border_style="red")
     Console(stderr=True).print(panel)
 
 

@@ -130,6 +130,12 @@ def test_a_map_that_is_upside_down(site):
     refused(processed(site), site, 1, "do not match the map")
 
 
+def test_a_map_with_free_and_occupied_swapped(site):
+    path = site / "map.yaml"
+    path.write_text(path.read_text().replace("negate: 0", "negate: 1"))
+    refused(processed(site, "run.mcap", "--start-pose", "1,1,0"), site, 1, "negate")
+
+
 def test_laser_scans_without_any_return(site):
     write_log(site / "void.mcap", returns=False)
     refused(processed(site, "void.mcap"), site, 4, "return")

@@ -1,6 +1,7 @@
 """Files that someone has made to do harm: each is refused in a few words, in little memory."""
 
 import json
+import os
 import pickle
 import zipfile
 
@@ -89,13 +90,47 @@ def test_aliases_that_multiply_are_not_written_out(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("key", "value"), [("occupied_thresh", "high"), ("free_thresh", 7), ("image", [1, 2])]
+    ("key", "value"),
+    [
+        ("occupied_thresh", "high"),
+        ("free_thresh", 7),
+        ("free_thresh", 0.7),
+        ("image", [1, 2]),
+        ("negate", "no"),
+        ("mode", ["trinary"]),
+        ("resolution", True),
+        ("resolution", 1e-300),
+        ("origin", [0, 0, 90]),
+        ("origin", [1e300, 0, 0]),
+    ],
 )
 def test_a_description_of_a_map_with_nonsense_is_refused_by_name(tmp_path, key, value):
     good = {"image": "map.pgm", "resolution": 0.05, "origin": [0, 0, 0]}
     (tmp_path / "map.yaml").write_text(json.dumps(good | {key: value}))
     with pytest.raises(MapError, match=key):
         read_map(tmp_path / "map.yaml")
+
+
+def test_no_other_program_is_called_for_an_image(tmp_path):
+    (tmp_path / "map.pgm").write_text("%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n")
+    (tmp_path / "map.yaml").write_text("image: map.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n")
+    with pytest.raises(MapError, match="not an image"):
+        read_map(tmp_path / "map.yaml")
+
+
+def test_pipes_are_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "map.yaml").write_text("image: pipe\nresolution: 0.05\norigin: [0, 0, 0]\n")
+    for name in ("map.yaml", "pipe"):
+        with pytest.raises(MapError, match="pipe: not a file"):
+            read_map(tmp_path / name)
+    with pytest.raises(LogError, match="neither a file nor a folder"):
+        log_files(tmp_path / "pipe")
+
+
+def test_a_path_that_the_system_refuses_is_told_with_its_reason(tmp_path):
+    with pytest.raises(LogError, match=r"cannot be opened \(File name too long\)"):
+        log_files(tmp_path / ("n" * 300))
 
 
 @pytest.mark.parametrize("name", ["../out.mcap", "/etc/hostname", "out.mcap.zstd/../../out.mcap"])

@@ -2,6 +2,7 @@
 
 import json
 import os
+import time
 from dataclasses import fields, is_dataclass, replace
 
 import numpy as np
@@ -174,6 +175,18 @@ def test_the_cache_does_not_grow_beyond_its_bound(site, cache, monkeypatch):
     cache.get(file.stem)
     cache.put("third", kept)
     assert {path.stem for path in cache.folder.iterdir()} == {file.stem, "third"}
+
+
+def test_what_killed_runs_left_in_the_cache_is_removed_in_time(site, cache):
+    run_of(site, cache)
+    for name, age_s in {".old.1": 7200, ".new.2": 60}.items():
+        (cache.folder / name).touch()
+        then = time.time() - age_s
+        os.utime(cache.folder / name, (then, then))
+    (file,) = cache.folder.glob("*.npz")
+    kept = cache.get(file.stem)
+    cache.put("other", kept)
+    assert {path.name for path in cache.folder.glob(".*")} == {".new.2"}
 
 
 def test_a_cache_that_cannot_be_written_costs_nothing_but_time(site, tmp_path, fresh):

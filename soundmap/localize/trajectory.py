@@ -41,6 +41,9 @@ MOUNT_ROUNDS = 4
 ROUNDS = 4
 """Times that all poses are smoothed and it is judged anew which of them to trust."""
 
+MOST_IN_WALLS = 0.5
+"""A map in which more of the way than this leads through walls shows something else."""
+
 
 def estimate_trajectory(
     lasers: Iterable[LaserScan],
@@ -235,6 +238,13 @@ def _checked(
     usable = estimate.usable[last_of_its_time]
     if not usable.any():
         raise MapError(_why_lost(estimate, room))
+    cells = room.frame.cells(estimate.pose[estimate.usable, :2])
+    within = cells[room.frame.contains(cells)]
+    if np.count_nonzero(room.occupied[within[:, 0], within[:, 1]]) > MOST_IN_WALLS * len(cells):
+        raise MapError(
+            "where the laser scans match the map best, the robot drives through what the map shows "
+            "as occupied. Are free and occupied swapped in it (negate)?"
+        )
     lost = int(np.count_nonzero(~usable))
     losses.add("robot not localized", STAGE, effect="sound not fused", count=lost)
     covariance = estimate.covariance

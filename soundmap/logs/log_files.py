@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import stat
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +25,17 @@ def log_files(path: Path) -> tuple[Path, ...]:
     LogError
         Nothing is there, or the folder cannot be understood.
     """
-    if path.is_dir():
+    try:
+        mode = path.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        raise LogError(f"{path}: no such file or folder. Check the path.") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise LogError(f"{path}: cannot be opened ({reason}). Check the path.") from None
+    if stat.S_ISDIR(mode):
         return _splits(path)
-    if not path.exists():
-        raise LogError(f"{path}: no such file or folder. Check the path.")
+    if not stat.S_ISREG(mode):
+        raise LogError(f"{path}: neither a file nor a folder. Write what it gives to a file first.")
     return (path,)
 
 

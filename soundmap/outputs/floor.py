@@ -19,7 +19,7 @@ from soundmap.geometry import FloatArray
 from soundmap.grid import GridFrame, OccupancyGrid
 from soundmap.outputs.area import Area, coarsened, cropped
 from soundmap.outputs.labels import is_far, label_offsets
-from soundmap.outputs.wording import ellipse_95
+from soundmap.outputs.wording import ellipse_95, printable
 
 WALL, UNKNOWN, OPEN = 0.25, 0.90, 1.0
 DIMMED_UNKNOWN, DIMMED_OPEN = 0.80, 0.90
@@ -311,6 +311,7 @@ def shortened(text: str, most: int) -> str:
     >>> shortened("a very long name: power map", 15)
     'a very…ower map'
     """
+    text = printable(text)
     if len(text) <= most:
         return text
     start = (most - 1) * 3 // 7

@@ -8,6 +8,7 @@ from soundmap.outputs.wording import (
     chance_text,
     flags_text,
     level_text,
+    printable,
     printed_reference,
     ratio_text,
 )
@@ -18,7 +19,12 @@ def run_markdown(run: Run) -> str:
     """What was found, in a few lines and a table."""
     unit = printed_reference(str(run.sources.reference))
     usable = f"{100 * run.trajectory.usable.mean():.1f} %" if len(run.trajectory) else "none"
-    lines = [f"# {run.log.name}", "", f"{run.duration_s:.1f} s; {usable} of the poses trusted.", ""]
+    lines = [
+        f"# {printable(run.log.name)}",
+        "",
+        f"{run.duration_s:.1f} s; {usable} of the poses trusted.",
+        "",
+    ]
     rows = source_rows(run.sources)
     remarks = " remarks |" if any(map(flags_text, rows)) else ""
     if rows:

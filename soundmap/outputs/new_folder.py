@@ -153,7 +153,11 @@ def _locked_folder(partial: Path) -> int | None:
     unnamed = partial.with_name(f".{secrets.token_hex(8)}")
     unnamed.mkdir()
     lock = _lock(unnamed)
-    unnamed.rename(partial)
+    try:
+        unnamed.rename(partial)
+    except OSError:
+        unnamed.rmdir()
+        raise
     return lock
 
 

@@ -244,5 +244,6 @@ def _write_report(
     (folder / "sources.csv").write_text(csv_text(columns, report["sources"]), encoding="utf-8")
     plain = json_text(report)
     page = report_html(json.loads(plain), shown)
-    (folder / "report.html").write_text(page, encoding="utf-8")
+    # A name that is not UTF-8 must not cost the page.
+    (folder / "report.html").write_text(page, encoding="utf-8", errors="backslashreplace")
     (folder / REPORT).write_text(plain + "\n", encoding="utf-8")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import unicodedata
 from collections.abc import Mapping
 from typing import Any
 
@@ -20,6 +21,25 @@ LEAST_CHANCE = 1e-6
 """Probabilities below this say more about the model than about the world."""
 
 Row = Mapping[str, Any]
+
+
+def printable(text: str) -> str:
+    r"""Text in which what no terminal or picture should be given stands as an escape.
+
+    Names come from logs and file systems: they may hold codes that move the cursor, and bytes that
+    are no letters.
+
+    Examples
+    --------
+    >>> printable("/mics\x1b[2J, ünder Größe")
+    '/mics\\x1b[2J, ünder Größe'
+    """
+    return "".join(
+        char.encode("unicode_escape").decode()
+        if unicodedata.category(char) in ("Cc", "Cf", "Cs") and char != "\n"
+        else char
+        for char in text
+    )
 
 
 def level_text(row: Row) -> str:

@@ -110,6 +110,15 @@ def test_a_file_in_the_way_is_named(tmp_path, folder):
         write_run_folder(tmp_path / folder)
 
 
+def test_a_name_too_long_for_the_disk_leaves_nothing_behind(tmp_path):
+    with (
+        pytest.raises(OutputError, match="File name too long"),
+        new_folder(tmp_path / ("n" * 245), force=False),
+    ):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_the_working_folder_is_not_pulled_away_from_under_the_user(tmp_path, monkeypatch):
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
