@@ -6,6 +6,8 @@ again, at most 0.1 m from there.
 
 import copy
 import dataclasses
+import itertools
+import json
 
 import numpy as np
 import pytest
@@ -13,7 +15,9 @@ import small_logs
 import worlds
 from logwriter import SECOND, audio_frame, time_of
 from small_logs import MICROPHONES, RATE, START_NS, changed
+from typer.testing import CliRunner
 
+from soundmap.cli import app
 from soundmap.config import loaded_config
 from soundmap.logs.robot_log import open_log
 from soundmap.logs.summary import log_summary
@@ -128,6 +132,29 @@ def test_audio_blocks_that_are_repeated(site, drive):
     expect(reported(site, events), what, 10, 3.02, 3.2)
 
 
+def test_audio_blocks_that_overlap(site, drive):
+    """Each block of a stretch begins with what the one before ended with."""
+    frames, by_topic = 80, [event for event in drive if event.topic == "/mics"]
+    before = {b.time_ns: samples_of(a)[-frames:] for a, b in itertools.pairwise(by_topic)}
+
+    def longer(event):
+        samples = np.concatenate([before[event.time_ns], samples_of(event)])
+        return with_values(event, **audio_frame(stamp_of(event), samples, RATE))
+
+    events = changed(drive, "/mics", during(3.0, 3.2, longer))
+    what = "audio block begins before the end of the one before"
+    expect(reported(site, events), what, 10, 3.02, 3.2)
+
+
+@pytest.mark.parametrize(("topic", "sensor"), [("/scan", "laser"), ("/odom", "odometry")])
+def test_stamps_that_run_backwards(site, drive, topic, sensor):
+    back = SECOND // 2
+    events = changed(drive, topic, during(3.0, 3.1, lambda e: stamped(e, stamp_of(e) - back)))
+    count = sum(event.topic == topic and 3.0 < seconds(event) <= 3.1 for event in drive)
+    what = f"{sensor} stamp runs backward or repeats"
+    expect(reported(site, events), what, count, 3.02 if topic == "/odom" else 3.05, 3.1)
+
+
 @pytest.mark.parametrize("topic", ["/mics", "/scan", "/odom"])
 @pytest.mark.parametrize("step_s", [-0.5, 0.4, 3600.0])
 def test_a_clock_that_is_set_on_the_way(site, drive, topic, step_s):
@@ -238,11 +265,12 @@ def test_laser_scans_without_a_return(site, drive):
     expect(reported(site, events), "laser scan without a single return", 8, 3.02, 3.4)
 
 
-def test_laser_scans_with_too_few_ranges(site, drive):
-    def short(event):
-        return with_values(event, ranges=event.values["ranges"][:200])
+@pytest.mark.parametrize("beams", [200, 500])
+def test_laser_scans_with_too_few_or_too_many_ranges(site, drive, beams):
+    def other(event):
+        return with_values(event, ranges=np.resize(event.values["ranges"], beams))
 
-    events = changed(drive, "/scan", during(3.0, 3.4, short))
+    events = changed(drive, "/scan", during(3.0, 3.4, other))
     what = "laser scan with more or fewer ranges than its angles tell"
     expect(reported(site, events), what, 8, 3.02, 3.4)
 
@@ -317,6 +345,25 @@ def test_odometry_that_sticks(site, drive):
     events = changed(drive, "/odom", during(4.0, 5.0, sticks))
     losses = reported(site, events)
     assert losses["odometry jumps"].count == 1
+
+
+def test_a_fault_is_told_everywhere_and_strict_makes_it_an_exit_code(site, drive):
+    folder, _ = site
+    events = changed(drive, "/mics", during(MIDDLE_S, 3.4, lambda event: None))
+    small_logs.write(folder / "run.mcap", events)
+    given = [folder / "run.mcap", "--config", folder / "robot.toml"]
+    more = ["--map", folder / "map.yaml", "--start-pose", "1,1,0", "--figures", "none", "--strict"]
+    command = ["process", *given, *more, "--out", folder / "out"]
+    result = CliRunner().invoke(app, [str(argument) for argument in command])
+    assert result.exit_code == 5
+    assert "gap in the audio" in result.stderr
+    row = next(line for line in result.stdout.splitlines() if "gap in the" in line)
+    assert row.split()[:5] == ["lost", "1", "at", "3.4", "s"]
+    written = json.loads((folder / "out" / "report.json").read_text())["losses"]
+    result = CliRunner().invoke(app, ["info", *map(str, given), "--json"])
+    for losses in (written, json.loads(result.stdout)["losses"]):
+        told = [(loss["what"], loss["count"], loss["first_s"]) for loss in losses]
+        assert told == [("gap in the audio", 1, pytest.approx(3.4, abs=0.06))]
 
 
 def test_fields_of_a_loss_are_what_the_report_says():

@@ -135,12 +135,20 @@ def _count_clock_losses(
         effect="left out",
         time_ns=logged_ns[~clock.kept],
     )
+    overlaps = int(np.count_nonzero(clock.overlaps))
+    losses.add(
+        "audio block begins before the end of the one before",
+        topic,
+        count=overlaps,
+        effect="the two are not joined",
+        time_ns=logged_ns[clock.overlaps],
+    )
     losses.add(
         "gap in the audio",
         topic,
-        count=clock.gaps,
+        count=clock.gaps - overlaps,
         effect=f"{clock.lost_s:.2f} s missing; nothing is joined over it",
-        time_ns=logged_ns[clock.kept & ~clock.continues][1:],
+        time_ns=logged_ns[clock.kept & ~clock.continues & ~clock.overlaps][1:],
     )
     if abs(clock.drift_ppm) > WRONG_RATE_PPM:
         losses.add(

@@ -84,7 +84,7 @@ def odometry_trajectory(
     topic: str,
     losses: LossLedger,
     *,
-    ahead_ns: int = 0,
+    logged_ns: NDArray[np.int64],
 ) -> tuple[Trajectory, str]:
     """The base in the odometry frame, and whether that is by "pose" or "twist".
 
@@ -98,8 +98,8 @@ def odometry_trajectory(
         For the losses.
     losses : LossLedger
         Where messages left out and poses replaced are counted.
-    ahead_ns : int
-        How far the times are ahead of the log's own.
+    logged_ns : ndarray of int64, shape (K,)
+        When the messages were logged: the times of losses.
     """
     rising = increasing(time_ns)
     losses.add(
@@ -107,9 +107,9 @@ def odometry_trajectory(
         topic,
         count=int(np.count_nonzero(~rising)),
         effect="message left out",
-        time_ns=time_ns[~rising] - ahead_ns,
+        time_ns=logged_ns[~rising],
     )
-    time_ns, numbers = time_ns[rising], numbers[rising]
+    time_ns, numbers, logged_ns = time_ns[rising], numbers[rising], logged_ns[rising]
     pose, sound = _planar_poses(numbers)
     twist = numbers[:, [7, 8, 10]]
     moving = np.all(np.isfinite(twist), axis=1)
@@ -122,14 +122,14 @@ def odometry_trajectory(
         topic,
         count=int(np.count_nonzero(by_twist)),
         effect="motion taken from the twist",
-        time_ns=time_ns[by_twist] - ahead_ns,
+        time_ns=logged_ns[by_twist],
     )
     losses.add(
         "odometry pose is not finite, nor is the twist usable",
         topic,
         count=int(np.count_nonzero(bad & ~moving)),
         effect="message left out",
-        time_ns=time_ns[bad & ~moving] - ahead_ns,
+        time_ns=logged_ns[bad & ~moving],
     )
     keep = sound | moving
     time_ns, pose, sound, twist = time_ns[keep], pose[keep], sound[keep], twist[keep]
@@ -142,7 +142,7 @@ def odometry_trajectory(
         topic,
         count=len(jumps),
         effect="taken for a reset: motion as before it",
-        time_ns=time_ns[jumps] - ahead_ns,
+        time_ns=logged_ns[keep][jumps],
     )
     source = "twist" if np.count_nonzero(by_twist) > np.count_nonzero(sound) else "pose"
     return Trajectory(time_ns, pose, np.ones(len(time_ns), dtype=bool)), source

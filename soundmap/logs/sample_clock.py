@@ -51,6 +51,8 @@ class SampleClock:
         False for a block that repeats or overlaps what came before.
     continues : ndarray of bool, shape (B,)
         True if the block follows the last kept one without a gap.
+    overlaps : ndarray of bool, shape (B,)
+        True if the block is kept but begins before the last kept one has ended.
     rate_hz : float
         Sample rate by the clock of the stamps [Hz].
     drift_ppm : float
@@ -58,7 +60,7 @@ class SampleClock:
     jitter_s : float
         Standard deviation of the stamps about the line, by their median deviation [s].
     gaps : int
-        How often samples are missing or the clock was set.
+        How often samples are missing or the clock was set, overlaps included.
     lost_s : float
         Time of the missing samples [s].
     """
@@ -66,6 +68,7 @@ class SampleClock:
     start_ns: NDArray[np.int64]
     kept: NDArray[np.bool_]
     continues: NDArray[np.bool_]
+    overlaps: NDArray[np.bool_]
     rate_hz: float
     drift_ppm: float
     jitter_s: float
@@ -131,11 +134,16 @@ def sample_clock(
     continues = np.zeros(len(stamps), dtype=bool)
     continues[index] = follows
     kept[index] = in_order
+    overlaps = np.zeros(len(stamps), dtype=bool)
+    whole = index[in_order]
+    ends_s = start_s[in_order] + lengths[whole] / rate
+    overlaps[whole[1:]] = ~follows[in_order][1:] & (start_s[in_order][1:] < ends_s[:-1])
     residual = early - level
     return SampleClock(
         start_ns=all_starts,
         kept=kept,
         continues=continues & kept,
+        overlaps=overlaps,
         rate_hz=rate,
         drift_ppm=(rate / nominal_rate_hz - 1.0) * 1e6,
         jitter_s=float(1.4826 * np.median(np.abs(residual))),

@@ -103,8 +103,9 @@ def odometry_stream(
         name, record = topic.name, topic.record
     times, ahead_ns = stream_times(record.stamp_ns, record.log_time_ns, name, losses)
     whole = times != DAMAGED
+    logged_ns = np.array(record.log_time_ns, dtype=np.int64)
     trajectory, source = odometry_trajectory(
-        times[whole], record.table()[whole], name, losses, ahead_ns=ahead_ns
+        times[whole], record.table()[whole], name, losses, logged_ns=logged_ns[whole]
     )
     if len(trajectory) < 2:
         raise NothingUsableError(
@@ -112,7 +113,7 @@ def odometry_stream(
             f"{len(trajectory)} of them sound. Check the robot's odometry."
         )
     source = "transform" if topic is None else source
-    span_ns = min(record.log_time_ns), max(record.log_time_ns)
+    span_ns = int(logged_ns.min()), int(logged_ns.max())
     return OdometryStream(name, trajectory, source, record.parent, record.child, ahead_ns, span_ns)
 
 

@@ -227,6 +227,38 @@ def test_a_chunk_that_was_cut_out_is_missed_if_the_summary_counts_its_messages(t
     assert [(loss.what, loss.count) for loss in losses] == [(MISSING, missing)]
 
 
+def test_a_chunk_compressed_in_an_unknown_way_is_left_out_and_named(tmp_path):
+    path = write(tmp_path / "log.mcap")
+    records = mutations.records_of(path.read_bytes())
+    place = next(i for i, record in enumerate(records) if record[0] == 6)
+    records[place] = records[place].replace(b"zstd", b"zpaq", 1)
+    path.write_bytes(mutations.joined(records))
+    messages, losses, _ = read(path)
+    missing = 200 - len(messages)
+    assert 0 < missing < 100
+    assert [(loss.what, loss.count) for loss in losses] == [
+        ("damaged chunk", 1),
+        (MISSING, missing),
+    ]
+    assert "'zpaq'" in next(iter(losses)).effect
+
+
+@pytest.mark.parametrize("chunking", [True, False])
+def test_records_of_kinds_still_to_come_are_passed_over(tmp_path, chunking):
+    path = write(tmp_path / "log.mcap", use_chunking=chunking)
+    records = mutations.records_of(path.read_bytes())
+    end = next(i for i, record in enumerate(records) if record[0] == 15)
+    for place in range(end, 0, -1):
+        records.insert(place, struct.pack("<BQ", 0x7F, 40) + bytes(40))
+        records.insert(place, struct.pack("<BQ", 0xFE, 0))
+    # Without the summary, whose offsets are no longer true.
+    content = mutations.joined(records[: records.index(records[3 * end])])
+    path.write_bytes(content)
+    messages, losses, _ = read(path)
+    assert numbers(messages) == list(range(200))
+    assert not {"unreadable record", "damaged chunk"} & {loss.what for loss in losses}
+
+
 @pytest.mark.parametrize("claimed", ["as packed", "small"])
 def test_a_chunk_that_would_expand_to_a_gigabyte_is_refused_in_little_memory(tmp_path, claimed):
     import resource
