@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from soundmap.cli import app
 from soundmap.config import loaded_config
-from soundmap.errors import ConfigError, NothingUsableError
+from soundmap.errors import ConfigError, LogError, NothingUsableError
 from soundmap.logs.robot_log import open_log
 from soundmap.outputs.illustrator import Illustrator
 from soundmap.outputs.new_folder import new_folder
@@ -99,6 +99,24 @@ def test_a_sensor_that_says_one_thing_and_no_more_ends_early(tmp_path, drive):
     first = next(event for event in drive if event.topic == "/scan")
     log = opened(tmp_path, [e for e in drive if e.topic != "/scan"] + [first])
     assert lost(log) == ["ends before the other sensors do"]
+
+
+@pytest.mark.parametrize("chunking", [True, False])
+@pytest.mark.parametrize("change", ["cut short", "overwritten", "removed"])
+def test_a_log_that_becomes_another_while_it_is_read_is_refused(tmp_path, drive, chunking, change):
+    path = small_logs.write(tmp_path / "log.mcap", drive, use_chunking=chunking)
+    log = open_log(path, settings(tmp_path))
+    size = path.stat().st_size
+    if change == "cut short":
+        os.truncate(path, size // 3)
+    elif change == "overwritten":
+        with path.open("r+b") as file:
+            file.seek(size // 3)
+            file.write(bytes(size // 3))
+    else:
+        path.unlink()
+    with pytest.raises(LogError, match="changed or removed while it was read"):
+        list(log.measurements())
 
 
 def test_an_error_tells_what_was_lost_before_it(tmp_path, drive):

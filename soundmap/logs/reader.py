@@ -48,7 +48,9 @@ class McapLog:
         for file in files:
             _check_magic(file)
         # A log that is still being written is read up to where it ends now, in every pass.
-        self.sizes = tuple(file.stat().st_size for file in files)
+        states = [file.stat() for file in files]
+        self.sizes = tuple(state.st_size for state in states)
+        self._changed_ns = tuple(state.st_mtime_ns for state in states)
         self.known_chunks: dict[tuple[int, int], KnownChunk] = {}
         self.known_channels: dict[int, dict[int, Channel]] = {}
         self._surveyed = False
@@ -78,8 +80,35 @@ class McapLog:
         later passes will want.
         """
         for number, file in enumerate(self.files):
-            yield from _in_order(FileWalk(self, number, file, wanted).batches())
+            try:
+                yield from _in_order(FileWalk(self, number, file, wanted).batches())
+            except (OSError, struct.error) as error:
+                self._refuse_changes()
+                raise LogError(f"{file}: cannot be read on ({error}). Is the disk sound?") from None
+        self._refuse_changes()
         self._surveyed = True
+
+    def _refuse_changes(self) -> None:
+        """A log may grow while it is read, but not become another: passes would not fit together.
+
+        Raises
+        ------
+        LogError
+            It has.
+        """
+        for file, size, changed_ns in zip(self.files, self.sizes, self._changed_ns, strict=True):
+            try:
+                state = file.stat()
+            except OSError:
+                state = None
+            grown = state is not None and state.st_size > size
+            if not grown and (
+                state is None or (state.st_size, state.st_mtime_ns) != (size, changed_ns)
+            ):
+                raise LogError(
+                    f"{file}: has been changed or removed while it was read. Try again once nobody "
+                    "writes to it."
+                )
 
     def count(self, what: str, where: str, effect: str, *, count: int = 1) -> None:
         """Count damage, unless an earlier pass has."""
