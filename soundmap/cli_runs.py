@@ -105,6 +105,13 @@ def evaluate(
         ),
     ] = None,
     *,
+    align: Annotated[
+        bool,
+        typer.Option(
+            "--align",
+            help="Lay the run's trajectory on the true one first: for runs that built a map.",
+        ),
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Compare a run with the truth, as in the paper's Table 2.
@@ -113,7 +120,9 @@ def evaluate(
     """
     from soundmap.evaluate import evaluation, evaluation_view, read_places
 
-    result = evaluation(run, sources, trajectory)
+    if align and figure is not None:
+        raise typer.BadParameter("--figure draws the run in its own frame: leave --align out.")
+    result = evaluation(run, sources, trajectory, align=align)
     if figure is not None:
         from soundmap.outputs.pictures import write_truth_picture
         from soundmap.outputs.stored_run import read_run

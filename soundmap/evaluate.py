@@ -5,14 +5,14 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from soundmap.errors import LogError
-from soundmap.geometry import FloatArray, Trajectory, wrapped_angle
+from soundmap.geometry import FloatArray, Trajectory, composed, transformed, wrapped_angle
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -123,7 +123,9 @@ class Evaluation:
         }
 
 
-def evaluation(run: Path, sources: Path, trajectory: Path | None = None) -> Evaluation:
+def evaluation(
+    run: Path, sources: Path, trajectory: Path | None = None, *, align: bool = False
+) -> Evaluation:
     """A run folder compared with its truth.
 
     Parameters
@@ -135,24 +137,57 @@ def evaluation(run: Path, sources: Path, trajectory: Path | None = None) -> Eval
         CSV with at least the columns ``id,x_m,y_m``.
     trajectory : Path, optional
         True poses in TUM format, in the same map frame.
+    align : bool
+        The run has a map frame of its own: first lay its trajectory on the true one, by the motion
+        with the least squares, and its sources with it.
 
     Raises
     ------
     LogError
-        One of the files cannot be read or does not hold what it should.
+        One of the files cannot be read or does not hold what it should, or the true trajectory
+        that a run is aligned by is not given.
     """
     truth, found = read_places(sources), read_places(run / "sources.csv")
-    matches, left_over = matched(truth, found)
+    if align and trajectory is None:
+        raise LogError("a run is aligned by its trajectory: give the true one with --trajectory.")
     error = None
     if trajectory is not None:
         estimate_file = run / "trajectory.tum"
-        error = trajectory_error(read_tum(estimate_file), read_tum(trajectory))
+        estimate, true_way = read_tum(estimate_file), read_tum(trajectory)
+        if align:
+            frame = frame_in_truth(estimate, true_way)
+            estimate = replace(estimate, pose=composed(frame, estimate.pose))
+            found = [moved(place, frame) for place in found]
+        error = trajectory_error(estimate, true_way)
         if error is None:
             raise LogError(
                 f"{estimate_file}: no pose lies within the times of {trajectory}. "
                 "Give the trajectory of the same log."
             )
+    matches, left_over = matched(truth, found)
     return Evaluation(run.resolve().name, matches, left_over, error)
+
+
+def frame_in_truth(estimate: Trajectory, truth: Trajectory) -> FloatArray:
+    """Pose of a run's map frame in that of the truth, shape (3,), by the places of both.
+
+    The motion with the least squares (Umeyama, PAMI 1991, without scale); none where no times meet.
+    """
+    true = truth.at(estimate.time_ns)
+    inside = np.isfinite(true[:, 0])
+    if not inside.any():
+        return np.zeros(3)
+    own, true = estimate.pose[inside, :2], true[inside, :2]
+    a, b = own - own.mean(axis=0), true - true.mean(axis=0)
+    turn = np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))
+    shift = true.mean(axis=0) - transformed([0.0, 0.0, turn], own.mean(axis=0))
+    return np.array([*shift, turn])
+
+
+def moved(place: Place, frame: FloatArray) -> Place:
+    """A place of the frame at some pose, in the frame that the pose is given in."""
+    x, y = transformed(frame, [place.x_m, place.y_m])
+    return Place(place.id, float(x), float(y))
 
 
 def matched(

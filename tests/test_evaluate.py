@@ -143,3 +143,26 @@ def test_a_trajectory_of_another_time_is_refused(run: Path) -> None:
     (run / "trajectory.tum").write_text(tum(first=5000.0))
     with pytest.raises(LogError, match="no pose lies within the times"):
         evaluation(run, run.parent / "truth.csv", run.parent / "truth.tum")
+
+
+def test_a_run_with_a_map_of_its_own_is_laid_on_the_truth_first(run: Path) -> None:
+    # Its frame stands at (1, 2) of the true one, turned left by 90 degrees: x = 1 - v, y = 2 + u.
+    lines = []
+    for k in range(11):
+        half = 0.05 * k - math.pi / 4
+        place = f"{1_700_000_100 + 0.1 * k:.6f} -1 {1 - 0.2 * k:.6f} 0"
+        lines.append(f"{place} 0 0 {math.sin(half):.9f} {math.cos(half):.9f}")
+    (run / "trajectory.tum").write_text("\n".join(lines) + "\n")
+    (run / "sources.csv").write_text("id,x_m,y_m\nS1,0.0,0.0\nS2,0.0,-3.1\nS3,4.0,-3.0\n")
+    truth, way = run.parent / "truth.csv", run.parent / "truth.tum"
+    assert evaluation(run, truth, way).errors_m == []
+    result = evaluation(run, truth, way, align=True)
+    assert result.errors_m == pytest.approx([0.0, 0.1, 0.0], abs=1e-5)
+    assert result.trajectory is not None
+    assert result.trajectory.p95_m < 1e-5
+    assert result.trajectory.heading_mean_deg < 1e-3
+
+
+def test_alignment_needs_a_true_trajectory(run: Path) -> None:
+    with pytest.raises(LogError, match="give the true one with --trajectory"):
+        evaluation(run, run.parent / "truth.csv", align=True)
