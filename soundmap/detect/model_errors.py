@@ -70,24 +70,25 @@ class Precision:
                 own = slice(starts[band], starts[band + 1])
                 inverse[scans] = _inverse([mode[:, own] for mode in modes], inverse.shape[1])
 
-        side_by_side(invert, _parts(len(evidence)))
+        side_by_side(invert, parts(len(evidence)))
 
-    def times(self, columns: Single) -> Single:
-        r""":math:`\Sigma^{-1}` times columns (..., S, D)."""
+    def times(self, columns: Single, scans: slice = slice(None)) -> Single:
+        r""":math:`\Sigma^{-1}` of some scans times columns (..., S, D)."""
         out = np.empty_like(columns)
         flat, result = columns.reshape(-1, *columns.shape[-2:]), out.reshape(-1, *out.shape[-2:])
+        inverses = [inverse[scans] for inverse in self.inverse]
 
-        def multiply(scans: slice) -> None:
-            for band, inverse in enumerate(self.inverse):
+        def multiply(few: slice) -> None:
+            for band, inverse in enumerate(inverses):
                 own = slice(self.starts[band], self.starts[band + 1])
-                part = np.ascontiguousarray(flat[:, scans, own].transpose(1, 2, 0))
-                result[:, scans, own] = np.matmul(inverse[scans], part).transpose(2, 0, 1)
+                part = np.ascontiguousarray(flat[:, few, own].transpose(1, 2, 0))
+                result[:, few, own] = np.matmul(inverse[few], part).transpose(2, 0, 1)
 
-        side_by_side(multiply, _parts(columns.shape[-2]))
+        side_by_side(multiply, parts(columns.shape[-2]))
         return out
 
 
-def _parts(scans: int) -> list[slice]:
+def parts(scans: int) -> list[slice]:
     """Scans that are worked on at once."""
     return [slice(i, min(i + SCANS_AT_ONCE, scans)) for i in range(0, scans, SCANS_AT_ONCE)]
 

@@ -11,6 +11,7 @@ distance, and would pull them off.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
 from itertools import pairwise
@@ -20,9 +21,10 @@ from numpy.typing import NDArray
 
 from soundmap.detect.evidence import Evidence
 from soundmap.detect.harmonics import Single
-from soundmap.detect.model_errors import Precision, bearing_derivative
+from soundmap.detect.model_errors import Precision, bearing_derivative, parts
 from soundmap.detect.sound_paths import NEAREST_M, Kind, Path, Paths, sound_paths, waves_heard
 from soundmap.geometry import FloatArray
+from soundmap.side_by_side import side_by_side
 
 BEHIND_M = 0.8
 """A wall no farther from a source than this may reflect a share of its own of that source's sound:
@@ -261,9 +263,10 @@ class SparseFit:
         told = {share: [path for path in paths if heard[path]] for share, paths in ways.items()}
         return {share: paths for share, paths in told.items() if paths}
 
-    def _heard(self, component: Component, path: int) -> Single:
+    def _heard(self, component: Component, path: int, scans: slice = slice(None)) -> Single:
         paths = component.paths
-        return waves_heard(self.evidence, paths.wave[path], paths.aperture[path], paths.gain[path])
+        wave, aperture = paths.wave[path, scans], paths.aperture[path, scans]
+        return waves_heard(self.evidence, wave, aperture, paths.gain[path, scans], scans)
 
     def _bands(self, left: Single, right: Single) -> FloatArray:
         """Sum of products of two columns in each sub-band."""
@@ -322,57 +325,41 @@ class SparseFit:
         """Of all components, shape (K, B)."""
         return np.array([component.strength for component in self.components])
 
-    def _bordered(self, own: Single, weighted: Single) -> FloatArray:
-        """Normal matrix of some columns, and behind them all strengths, sub-band by sub-band."""
-        starts, count, bands = self.evidence.table.starts, len(own), len(self.gram)
-        components = len(self.components)
-        matrix = np.zeros((count + bands * components, count + bands * components))
-        flat = weighted.reshape(count, -1)
-        matrix[:count, :count] = flat @ own.reshape(count, -1).T
-        columns = np.stack([component.column for component in self.components])
-        for band, gram in enumerate(self.gram):
-            part = slice(starts[band], starts[band + 1])
-            place = slice(count + band * components, count + (band + 1) * components)
-            left = weighted[:, :, part].reshape(count, -1)
-            matrix[:count, place] = left @ columns[:, :, part].reshape(components, -1).T
-            matrix[place, :count] = matrix[:count, place].T
-            matrix[place, place] = gram
-        return matrix
-
     def _system(
         self, chosen: list[Component]
     ) -> tuple[FloatArray, FloatArray, list[tuple[Component, int]]]:
         """Normal equations of places (axes 0, 1) and shares (as `Share`), strengths free.
 
-        The strengths' own unknowns stand last; only the first ones have owners.
+        The strengths' own unknowns stand last, sub-band by sub-band; only the first ones have
+        owners.
         """
-        evidence, part = self.evidence, self.evidence.table.part
-        columns: list[Single] = []
         owners: list[tuple[Component, int]] = []
         for component in chosen:
-            if np.count_nonzero(component.paths.gain[Path.DIRECT]) < 3:
-                continue
-            strength = component.strength[part].astype(np.float32)
-            turned = bearing_derivative(evidence, component.paths) * strength
-            step = component.place_m - evidence.place_m
-            square = np.maximum(np.sum(step**2, axis=1), NEAREST_M**2) / evidence.handedness
-            for axis, bearing in enumerate((-step[:, 1] / square, step[:, 0] / square)):
-                columns.append(turned * bearing.astype(np.float32)[:, None])
-                owners.append((component, axis))
-            for share, paths in self._ways(component).items():
-                heard = np.sum([self._heard(component, path) for path in paths], axis=0)
-                columns.append(heard * strength)
-                owners.append((component, share))
+            if np.count_nonzero(component.paths.gain[Path.DIRECT]) >= 3:
+                owners += [(component, axis) for axis in (0, 1, *self._ways(component))]
         if not owners:
             return np.zeros((0, 0)), np.zeros(0), owners
-        own = np.stack(columns)
-        columns.clear()  # they are large
-        weighted = self.precision.times(own)
-        hessian = self._bordered(own, weighted)
+        count, components, bands = len(owners), len(self.components), len(self.gram)
+        hessian = np.zeros((count + bands * components,) * 2)
         gradient = np.zeros(len(hessian))
-        gradient[: len(own)] = weighted.reshape(len(own), -1) @ self.residual.ravel()
+
+        def of_some(scans: slice) -> tuple[Single, Single, FloatArray]:
+            own = np.stack(list(self._derivatives(owners, scans)))
+            weighted = self.precision.times(own, scans)
+            flat = weighted.reshape(count, -1)
+            squares = flat @ own.reshape(count, -1).T
+            return squares, flat @ self.residual[scans].ravel(), self._across(weighted, scans)
+
+        for squares, pull, across in side_by_side(of_some, parts(len(self.evidence))):
+            hessian[:count, :count] += squares
+            gradient[:count] += pull
+            hessian[:count, count:] += across
+        hessian[count:, :count] = hessian[:count, count:].T
+        for band, gram in enumerate(self.gram):
+            place = slice(count + band * components, count + (band + 1) * components)
+            hessian[place, place] = gram
         rest = self._product - np.einsum("bkl,lb->bk", self.gram, self._strengths)
-        gradient[len(own) :] = rest.ravel()
+        gradient[count:] = rest.ravel()
         for position, (component, axis) in enumerate(owners):
             hold = HOLD if axis < 2 else SHARE_SIGMA[Share(axis)] ** -2
             hessian[position, position] += hold
@@ -380,6 +367,35 @@ class SparseFit:
                 share = Share(axis)
                 gradient[position] -= hold * (component.shares[share] - ASSUMED[share])
         return hessian, gradient, owners
+
+    def _derivatives(self, owners: list[tuple[Component, int]], scans: slice) -> Iterator[Single]:
+        """Change of what some scans hear with each unknown, each (s, D)."""
+        evidence, part = self.evidence, self.evidence.table.part
+        for component, axis in owners:
+            strength = component.strength[part].astype(np.float32)
+            if axis >= 2:
+                paths = self._ways(component)[Share(axis)]
+                yield np.sum([self._heard(component, path, scans) for path in paths], 0) * strength
+                continue
+            if axis == 0:  # axis 1 of the same component follows
+                turned = bearing_derivative(evidence, component.paths, scans) * strength
+                step = component.place_m - evidence.place_m[scans]
+                square = np.maximum(np.sum(step**2, axis=1), NEAREST_M**2) / evidence.handedness
+            bearing = (-step[:, 1], step[:, 0])[axis] / square
+            yield turned * bearing.astype(np.float32)[:, None]
+
+    def _across(self, weighted: Single, scans: slice) -> FloatArray:
+        """Products of some columns (K', s, D) with those of all components, (K', B K)."""
+        starts, count = self.evidence.table.starts, len(weighted)
+        columns = np.stack([component.column[scans] for component in self.components])
+        return np.concatenate(
+            [
+                weighted[:, :, start:stop].reshape(count, -1)
+                @ columns[:, :, start:stop].reshape(len(columns), -1).T
+                for start, stop in pairwise(starts)
+            ],
+            axis=1,
+        )
 
 
 def _scaled_root(gram: FloatArray) -> tuple[FloatArray, FloatArray]:
