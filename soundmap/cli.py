@@ -277,7 +277,7 @@ def simulate(
 
 
 def main() -> None:
-    """Entry point of the ``soundmap`` command."""
+    """Run the command line."""
     # Small products gain nothing from threads of the linear algebra, and on a busy machine lose
     # several-fold to their waiting for one another. Read when numpy is first imported.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
