@@ -117,7 +117,7 @@ def _pose_of_background(room: OccupancyGrid, other: OccupancyGrid, notes: LossLe
         return np.zeros(3)
     x, y, turn = match.pose.tolist()
     effect = (
-        f"background moved by {x:.2f}, {y:.2f} m and turned by {np.degrees(turn):.1f} degrees: "
+        f"background moved by {x:z.2f}, {y:z.2f} m and turned by {np.degrees(turn):z.1f} degrees: "
         f"{100 * match.agreeing:.0f} % of the walls agree"
     )
     notes.remark(what, STAGE, effect=effect)

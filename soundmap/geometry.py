@@ -266,6 +266,11 @@ class Trajectory:
         step = np.diff(self.pose[:, :2], axis=0)
         return np.concatenate([np.zeros(min(len(self), 1)), np.cumsum(np.hypot(*step.T))])
 
+    def extent_m(self) -> float:
+        """Diagonal of the smallest upright rectangle that holds all poses to be trusted [m]."""
+        place = self.pose[self.usable, :2]
+        return float(np.hypot(*np.ptp(place, axis=0))) if len(place) else 0.0
+
     def usable_at(self, time_ns: ArrayLike) -> NDArray[np.bool_]:
         """Whether the poses on both sides of each time may be trusted; False outside the span."""
         wanted = np.asarray(time_ns, dtype=np.int64)

@@ -42,6 +42,8 @@ from soundmap.sound import AudioScans
 
 MOST_THREADS = 4
 """Threads that turn sound into audio scans; they keep up with any reading of the log."""
+LEAST_EXTENT_M = 0.5
+"""A robot that stays within this cannot tell where sound comes from, only from which side [m]."""
 
 
 def process(
@@ -104,6 +106,12 @@ def process(
         power_map = accumulator.power_map()
     with clock.stage("detect"):
         if config.detect.method == "sparse":
+            if trajectory.extent_m() < LEAST_EXTENT_M:
+                losses.remark(
+                    "robot hardly moves",
+                    "detect",
+                    effect="from one place bearings do not cross: hardly a source can be told",
+                )
             around = ranges_around(surroundings, trajectory, scans.time_ns, array.mount)
             sources = fitted_sources(
                 scans, around, trajectory, array, config.scan, config.detect, room=room

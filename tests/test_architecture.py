@@ -9,7 +9,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "soundmap"
 STAGES = {"logs", "mapping", "localize", "scan", "calibrate", "fuse", "detect"}
 COMPOSERS = {
     "replay", "map_log", "retelling", "comparison", "jobs", "cli", "cli_map", "cli_runs",
-    "terminal",
+    "start", "terminal",
 }  # fmt: skip
 SLOW = {"numba", "scipy", "matplotlib", "rerun", "google"}
 

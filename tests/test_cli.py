@@ -19,7 +19,7 @@ import soundmap.logs.summary
 import soundmap.outputs.pictures
 import soundmap.outputs.viewer
 import soundmap.replay
-from soundmap import __version__
+from soundmap import __version__, start
 from soundmap.cli import app
 from soundmap.errors import LogError, NothingUsableError
 from soundmap.outputs.illustrator import Illustrator
@@ -454,3 +454,14 @@ def test_a_missing_log_is_unreadable_input(tmp_path):
     assert result.stdout == ""
     assert "none.mcap" in result.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["room"]
+
+
+def test_a_stop_while_the_program_is_loading_leaves_no_traceback(monkeypatch):
+    class Loading:
+        def __getattr__(self, name):
+            raise KeyboardInterrupt
+
+    monkeypatch.setitem(sys.modules, "soundmap.cli", Loading())
+    with pytest.raises(SystemExit) as stopped:
+        start.main()
+    assert stopped.value.code == 130

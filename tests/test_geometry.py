@@ -125,3 +125,10 @@ class TestTrajectory:
     def test_times_out_of_order_are_refused(self):
         with pytest.raises(ValueError, match="increasing"):
             trajectory([10, 10], np.zeros((2, 3)))
+
+
+def test_the_extent_of_a_trajectory_is_that_of_its_trusted_poses():
+    pose = np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 1.0], [90.0, 0.0, 0.0]])
+    usable = np.array([True, True, False])
+    way = Trajectory(np.arange(3), pose, usable)
+    assert way.extent_m() == pytest.approx(5.0)

@@ -27,6 +27,8 @@ STRETCH_M, STRETCH_SCANS, MOST_STRETCHES = 15.0, 400, 20
 """Places are sought on stretches of the way of this length and no more scans; on so many."""
 MARGIN_NS = 250_000_000
 """Poses are needed so long before and after a scan."""
+LEAST_EXTENT_M = 1.0
+"""Bearings from a smaller area cross nowhere, whatever the yaw."""
 LEAST_EXPLAINED = 0.7
 """Stretches on which less of what was heard comes from fixed places tell nothing."""
 EQUAL_SHARE = 0.02
@@ -74,6 +76,8 @@ def array_offsets(
     scans = scans[moved_apart(way(scans), time_ns[scans])]
     if len(scans) < LEAST_SCANS:
         return _nothing("too few audio scans with a trusted pose")
+    if trajectory.extent_m() < LEAST_EXTENT_M:
+        return _nothing(f"the robot stays within {LEAST_EXTENT_M:.0f} m")
     spans = _stretches(way(scans))
     scans = np.concatenate([scans[first:last] for first, last in spans])
     ends = np.cumsum([0, *(last - first for first, last in spans)])

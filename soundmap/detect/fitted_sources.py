@@ -40,6 +40,10 @@ LEAST_NOISE = 0.5
 """What is explained counts in units of what is left, but of no less than this of the noise."""
 ONE_SOURCE_M = 0.55
 """Components nearer to each other than this are one source."""
+VAGUE_M = 0.5
+"""A source is somewhere: within so much of where it is reported, with 95 %."""
+QUANTILE_95 = 5.991
+"""Of chi-square with two degrees of freedom."""
 STRETCH_M = 0.5
 ONE_SIDE_RAD = np.radians(40.0)
 LOUD_SIDE = 0.75
@@ -119,6 +123,7 @@ def _found(
         for each in _strongest_apart(told)
         if each.probability <= rate
         and effective_number(each.component.paths.gain[Path.DIRECT]) >= LEAST_SCANS
+        and _reach_m(each.placement) <= VAGUE_M
         and region.owns(each.placement.place_m)
     ]
     images = [
@@ -167,6 +172,11 @@ def _strongest_apart(told: Sequence[_Told]) -> list[_Told]:
         if min(apart, default=np.inf) > ONE_SOURCE_M:
             kept.append(each)
     return kept
+
+
+def _reach_m(place: Placement) -> float:
+    """Greater half axis of the 95 % ellipse [m]."""
+    return float(np.sqrt(QUANTILE_95 * np.linalg.eigvalsh(place.covariance_m2)[-1]))
 
 
 def _behind_m(component: Component) -> float:

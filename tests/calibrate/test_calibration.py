@@ -170,3 +170,9 @@ def test_a_long_run_is_one_of_many_stretches():
     assert 1e3 * found.clock.correction == pytest.approx(40.0, abs=3.0)
     assert np.degrees(found.yaw.correction) == pytest.approx(-3.0, abs=0.2)
     assert found.places > 8
+
+
+def test_a_robot_that_hardly_moves_says_so():
+    found = offsets_of(((0.6, 2.5), (0.6, -2.5), (0.6, 2.5), (0.6, -2.5)))
+    assert found.yaw.verdict is OffsetVerdict.UNKNOWN
+    assert np.isnan(found.yaw.value)

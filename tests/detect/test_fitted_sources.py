@@ -15,10 +15,10 @@ POSITIONS = np.stack([0.155 * np.cos(ANGLE), 0.155 * np.sin(ANGLE), 0.0 * ANGLE]
 MOUNT = Mount.planar(0.1, 0.0, 0.5, 0.3)
 
 
-def way():
-    """Half a lap through the room, 20 s at 0.3 m/s, with a turn in the middle."""
+def way(speed_m_s=0.3):
+    """Half a lap through the room in 20 s, with a turn in the middle."""
     time_s = np.arange(0.0, 20.0, 0.05)
-    along = 0.3 * time_s
+    along = speed_m_s * time_s
     x = np.where(along < 3.0, 1.5 + along, 4.5)
     y = np.where(along < 3.0, 1.5, 1.5 + np.minimum(along - 3.0, 2.0))
     heading = np.clip((along - 2.7) / 0.6, 0.0, 1.0) * 0.5 * np.pi
@@ -49,10 +49,10 @@ def response(toward, aperture=1.0):
     return total / 40
 
 
-def run(emitters, *, ambient=1.0, seed=1):
+def run(emitters, *, ambient=1.0, seed=1, speed_m_s=0.3):
     """Audio scans and laser ranges of the way; emitters are x, y and power at 1 m."""
     rng = np.random.default_rng(seed)
-    track = way()
+    track = way(speed_m_s)
     time_ns = track.time_ns[2:-2:2]
     power, ranges = [], []
     for pose in track.at(time_ns):
@@ -125,3 +125,9 @@ def test_the_level_is_that_of_the_loud_side_whatever_one_loud_stretch_says():
     assert _loud_side(facing, weight) == 1.4
     assert _loud_side(np.ones(1), np.ones(1)) == 1.0
     assert _loud_side(np.zeros(0), np.zeros(0)) == 1.0
+
+
+def test_from_nearly_one_place_no_source_in_the_open_is_told():
+    hanging = [(3.5, 3.2, 20.0)]
+    assert len(run(hanging)) == 1
+    assert len(run(hanging, speed_m_s=0.01)) == 0
