@@ -74,7 +74,7 @@ def processed(site: Path, log: str = "run.mcap", *more: object):
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
-def refused(result, site: Path, code: int, *words: str) -> None:
+def assert_refused(result, site: Path, code: int, *words: str) -> None:
     assert result.exit_code == code, result.output
     assert not isinstance(result.exception, Exception) or isinstance(result.exception, SystemExit)
     message = " ".join(result.stderr.split())
@@ -93,27 +93,27 @@ def test_the_sound_log_is_processed(site):
 
 def test_no_audio_topic(site):
     write_log(site / "deaf.mcap", audio=False)
-    refused(processed(site, "deaf.mcap"), site, 4, "deaf.mcap", "audio", "/scan")
+    assert_refused(processed(site, "deaf.mcap"), site, 4, "deaf.mcap", "audio", "/scan")
 
 
 def test_no_laser_topic(site):
     write_log(site / "blind.mcap", lasers=False)
-    refused(processed(site, "blind.mcap"), site, 4, "blind.mcap", "laser", "/odom")
+    assert_refused(processed(site, "blind.mcap"), site, 4, "blind.mcap", "laser", "/odom")
 
 
 def test_a_configured_topic_that_does_not_exist(site):
     (site / "robot.toml").write_text(ARRAY + '[topics]\naudio = "/mic"\n')
-    refused(processed(site), site, 2, "/mic", "/mics")
+    assert_refused(processed(site), site, 2, "/mic", "/mics")
 
 
 def test_another_number_of_channels_than_microphones(site):
     write_log(site / "eight.mcap", channels=8)
-    refused(processed(site, "eight.mcap"), site, 2, "/mics", "8 channels", "4")
+    assert_refused(processed(site, "eight.mcap"), site, 2, "/mics", "8 channels", "4")
 
 
 def test_no_such_map(site):
     (site / "map.yaml").unlink()
-    refused(processed(site), site, 1, "map.yaml", "cannot be read")
+    assert_refused(processed(site), site, 1, "map.yaml", "cannot be read")
 
 
 def test_a_map_of_somewhere_else(site):
@@ -121,55 +121,57 @@ def test_a_map_of_somewhere_else(site):
     pillars = np.zeros_like(hall.occupied)
     pillars[10::30, 10::30] = True
     write_map(site, OccupancyGrid(hall.frame, pillars, ~pillars))
-    refused(processed(site), site, 1, "do not match the map")
+    assert_refused(processed(site), site, 1, "do not match the map")
 
 
 def test_a_map_that_is_upside_down(site):
     room = worlds.room()
     write_map(site, OccupancyGrid(room.frame, room.occupied[::-1], room.free[::-1]))
-    refused(processed(site), site, 1, "do not match the map")
+    assert_refused(processed(site), site, 1, "do not match the map")
 
 
 def test_a_map_with_free_and_occupied_swapped(site):
     path = site / "map.yaml"
     path.write_text(path.read_text().replace("negate: 0", "negate: 1"))
-    refused(processed(site, "run.mcap", "--start-pose", "1,1,0"), site, 1, "negate")
+    assert_refused(processed(site, "run.mcap", "--start-pose", "1,1,0"), site, 1, "negate")
 
 
 def test_laser_scans_without_any_return(site):
     write_log(site / "void.mcap", returns=False)
-    refused(processed(site, "void.mcap"), site, 4, "return")
+    assert_refused(processed(site, "void.mcap"), site, 4, "return")
 
 
 def test_odometry_that_is_stuck(site):
     write_log(site / "stuck.mcap", moving=False)
-    refused(processed(site, "stuck.mcap"), site, 4, "odometry never moves")
+    assert_refused(processed(site, "stuck.mcap"), site, 4, "odometry never moves")
 
 
 def test_a_log_without_any_message(site):
     with LogWriter(site / "empty.mcap"):
         pass
-    refused(processed(site, "empty.mcap"), site, 4, "empty.mcap")
+    assert_refused(processed(site, "empty.mcap"), site, 4, "empty.mcap")
 
 
 def test_an_empty_file(site):
     (site / "nothing.mcap").touch()
-    refused(processed(site, "nothing.mcap"), site, 3, "nothing.mcap", "empty")
+    assert_refused(processed(site, "nothing.mcap"), site, 3, "nothing.mcap", "empty")
 
 
 def test_a_text_file_named_mcap(site):
     (site / "text.mcap").write_text("These are not the messages you are looking for.\n" * 9)
-    refused(processed(site, "text.mcap"), site, 3, "text.mcap", "MCAP")
+    assert_refused(processed(site, "text.mcap"), site, 3, "text.mcap", "MCAP")
 
 
 def test_an_unknown_key_in_the_configuration(site):
     (site / "robot.toml").write_text(ARRAY + "[fuse]\nd_maximum_m = 2.0\n")
-    refused(processed(site), site, 2, "robot.toml", "'d_maximum_m'", "did you mean 'd_max_m'?")
+    assert_refused(
+        processed(site), site, 2, "robot.toml", "'d_maximum_m'", "did you mean 'd_max_m'?"
+    )
 
 
 def test_audio_too_slow_for_the_band(site):
     (site / "robot.toml").write_text(ARRAY + "[scan]\nhigh_hz = 9000.0\n")
-    refused(processed(site), site, 2, "9000", "16000")
+    assert_refused(processed(site), site, 2, "9000", "16000")
 
 
 def test_audio_that_ends_before_one_scan_is_complete(site):
@@ -189,12 +191,12 @@ def test_audio_that_ends_before_one_scan_is_complete(site):
         for scan in SCANS:
             message = laser_scan(scan.time_ns, "laser", scan.range_m)
             log.ros2("/scan", "sensor_msgs/msg/LaserScan", message, scan.time_ns)
-    refused(processed(site, "short.mcap"), site, 4, "too short")
+    assert_refused(processed(site, "short.mcap"), site, 4, "too short")
 
 
 def test_every_fault_of_a_configuration_is_named_at_once(site):
     (site / "robot.toml").write_text(ARRAY + "[scan]\nbearings = 2\n[fuse]\ncell_m = -1\n")
-    refused(processed(site), site, 2, "2 wrong value(s)", "scan.bearings", "fuse.cell_m")
+    assert_refused(processed(site), site, 2, "2 wrong value(s)", "scan.bearings", "fuse.cell_m")
 
 
 def test_the_trajectory_of_the_sound_log_is_right(site):
