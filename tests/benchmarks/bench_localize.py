@@ -31,6 +31,7 @@ from drive_logs import Drive, simulated_drive
 
 from soundmap.config import Config
 from soundmap.errors import MapError
+from soundmap.evaluate import frame_in_truth
 from soundmap.geometry import Trajectory, composed, relative, wrapped_angle
 from soundmap.grid import OccupancyGrid
 from soundmap.localize.trajectory import estimate_trajectory
@@ -186,7 +187,7 @@ def real_log(path: Path, map_file: Path, truth_file: Path) -> None:
     rest = [scan for scan in scans if scan.time_ns > cut]
     built = build_map(lambda: begun, log.odometry, Config().map)
     own = built.trajectory.of_scans()
-    frame = frame_of(own, truth)
+    frame = frame_in_truth(own, truth)
     own = replace(own, pose=composed(frame, own.pose), usable=np.ones(len(own), dtype=bool))
     print(f"first 60 %, mapped: {judged(own, truth)}")
     maps = {
@@ -231,20 +232,6 @@ def lost_stretches(found: Trajectory) -> str:
     lost = np.flatnonzero(np.diff(usable) < 0)
     again = np.flatnonzero(np.diff(usable) > 0)
     return f"lost {len(lost)} times, found again {len(again)} times"
-
-
-def frame_of(built: Trajectory, truth: Trajectory) -> np.ndarray:
-    """Pose of a map's frame in that of the truth, by the poses of both (least squares)."""
-    true = truth.at(built.time_ns)
-    known = np.isfinite(true[:, 0])
-    own, true = built.pose[known, :2], true[known, :2]
-    centred, target = own - own.mean(axis=0), true - true.mean(axis=0)
-    turn = np.arctan2(
-        np.sum(centred[:, 0] * target[:, 1] - centred[:, 1] * target[:, 0]),
-        np.sum(centred * target),
-    )
-    middle = composed([0.0, 0.0, turn], [*own.mean(axis=0), 0.0])
-    return np.array([*(true.mean(axis=0) - middle[:2]), turn])
 
 
 if __name__ == "__main__":
