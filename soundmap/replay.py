@@ -23,7 +23,7 @@ from soundmap.fuse.fitted_map import fitted_power_map
 from soundmap.fuse.power_map import fused_scans, level_reference, power_map_frame
 from soundmap.fuse.surroundings import SurroundingsGatherer
 from soundmap.geometry import Trajectory
-from soundmap.grid import OccupancyGrid
+from soundmap.grid import GridFrame, OccupancyGrid
 from soundmap.localize.trajectory import localized
 from soundmap.localize.views import ViewChooser
 from soundmap.logs.log_files import log_files
@@ -38,7 +38,7 @@ from soundmap.run import Run
 from soundmap.scan.audio_scan import audio_scans, kept_scans
 from soundmap.scan.spectrum import band_bins
 from soundmap.sensors import ArrayOffsets, AudioBlock, LaserScan, MicArray
-from soundmap.sound import AudioScans
+from soundmap.sound import AudioScans, PowerMap, SourceList
 
 MOST_THREADS = 4
 """Threads that turn sound into audio scans; they keep up with any reading of the log."""
@@ -82,7 +82,7 @@ def process(
     given = None if map_path is None else read_map(map_path)
     clock = _Stopwatch(progress)
     measured, from_cache = _kept_or_measured(log_path, given, config, start_pose, cache, clock)
-    room, trajectory, surroundings = measured.room, measured.trajectory, measured.surroundings
+    room, trajectory = measured.room, measured.trajectory
     losses = LossLedger()
     with clock.stage("calibrate"):
         scans, array, offsets = _calibrated(measured.scans, measured.array, trajectory, config)
@@ -95,7 +95,7 @@ def process(
             scan.point_m is not None
             for scan in fused_scans(
                 scans,
-                surroundings,
+                measured.surroundings,
                 trajectory,
                 accumulator,
                 array.mount,
@@ -106,20 +106,7 @@ def process(
         power_map = accumulator.power_map()
     with clock.stage("detect"):
         if config.detect.method == "sparse":
-            if trajectory.extent_m() < LEAST_EXTENT_M:
-                losses.remark(
-                    "robot hardly moves",
-                    "detect",
-                    effect="from one place bearings do not cross: hardly a source can be told",
-                )
-            around = ranges_around(surroundings, trajectory, scans.time_ns, array.mount)
-            sources = fitted_sources(
-                scans, around, trajectory, array, config.scan, config.detect, room=room
-            )
-            sources = with_level_errors(sources, scans, trajectory, array, room, config.scan)
-            power_map = fitted_power_map(
-                sources, scans, around, trajectory, array, frame, config.scan, config.fuse
-            )
+            sources, power_map = _fitted(measured, scans, array, frame, config, losses)
         else:
             sources = detect_sources(power_map, config.detect)
     return Run(
@@ -144,6 +131,33 @@ def process(
         offsets=offsets,
         from_cache=from_cache,
     )
+
+
+def _fitted(
+    measured: Measured,
+    scans: AudioScans,
+    array: MicArray,
+    frame: GridFrame,
+    config: Config,
+    losses: LossLedger,
+) -> tuple[SourceList, PowerMap]:
+    """Sources of the fit to all scans, and the power map that goes with them."""
+    room, trajectory = measured.room, measured.trajectory
+    if trajectory.extent_m() < LEAST_EXTENT_M:
+        losses.remark(
+            "robot hardly moves",
+            "detect",
+            effect="from one place bearings do not cross: hardly a source can be told",
+        )
+    around = ranges_around(measured.surroundings, trajectory, scans.time_ns, array.mount)
+    sources = fitted_sources(
+        scans, around, trajectory, array, config.scan, config.detect, room=room
+    )
+    sources = with_level_errors(sources, scans, trajectory, array, room, config.scan)
+    power_map = fitted_power_map(
+        sources, scans, around, trajectory, array, frame, config.scan, config.fuse
+    )
+    return sources, power_map
 
 
 def _kept_or_measured(
