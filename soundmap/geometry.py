@@ -8,6 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 FloatArray = NDArray[np.float64]
+CHI_SQUARED_95 = 5.991
+"""95 % of a normal distribution in the plane lie within this squared distance (2 degrees of
+freedom)."""
 
 
 def wrapped_angle(angle: ArrayLike) -> FloatArray:

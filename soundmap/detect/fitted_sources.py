@@ -30,7 +30,7 @@ from soundmap.detect.sound_paths import Kind, Path
 from soundmap.detect.sparse_fit import Component, SparseFit
 from soundmap.detect.steadiness import steadiness
 from soundmap.detect.walls import surface_points, wall_lines
-from soundmap.geometry import FloatArray, Trajectory
+from soundmap.geometry import CHI_SQUARED_95, FloatArray, Trajectory
 from soundmap.grid import OccupancyGrid
 from soundmap.sensors import MicArray
 from soundmap.sound import AudioScans, Source, SourceFit, SourceList
@@ -42,8 +42,6 @@ ONE_SOURCE_M = 0.55
 """Components nearer to each other than this are one source."""
 VAGUE_M = 0.5
 """A source is somewhere: within so much of where it is reported, with 95 %."""
-QUANTILE_95 = 5.991
-"""Of chi-square with two degrees of freedom."""
 STRETCH_M = 0.5
 ONE_SIDE_RAD = np.radians(40.0)
 LOUD_SIDE = 0.75
@@ -176,7 +174,7 @@ def _strongest_apart(told: Sequence[_Told]) -> list[_Told]:
 
 def _reach_m(place: Placement) -> float:
     """Greater half axis of the 95 % ellipse [m]."""
-    return float(np.sqrt(QUANTILE_95 * np.linalg.eigvalsh(place.covariance_m2)[-1]))
+    return float(np.sqrt(CHI_SQUARED_95 * np.linalg.eigvalsh(place.covariance_m2)[-1]))
 
 
 def _behind_m(component: Component) -> float:

@@ -9,13 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from soundmap.geometry import FloatArray
+from soundmap.geometry import CHI_SQUARED_95, FloatArray
 from soundmap.sensors import OffsetVerdict
 
 NOTHING = "-"
-CHI_SQUARED_95 = 5.991
-"""95 % of a normal distribution in the plane lie within this squared distance (2 degrees of
-freedom)."""
 UNKNOWN = str(OffsetVerdict.UNKNOWN)
 LEAST_CHANCE = 1e-6
 """Probabilities below this say more about the model than about the world."""

@@ -27,14 +27,13 @@ from random_scenes import Difficulty, written_scene
 
 from soundmap.config import loaded_config
 from soundmap.evaluate import Place, matched, read_tum, trajectory_error
+from soundmap.geometry import CHI_SQUARED_95
 from soundmap.outputs.progress import SilentProgress
 from soundmap.replay import process
 from soundmap.run import Run
 from soundmap.simulate.simulation import simulated_run
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
-COVERAGE_95 = 5.991
-"""95 % quantile of chi-square with two degrees of freedom."""
 FIRST_SEED = {"tuning": 0, "judging": 7001}
 FIRST_SILENT_SEED = {"tuning": 100, "judging": 8001}
 
@@ -97,7 +96,7 @@ def judged(run: Run, truth_file: Path, difficulty: Difficulty, way: object) -> O
         if source.fit is not None:
             step = np.array([source.x_m - place.x_m, source.y_m - place.y_m])
             distance = step @ np.linalg.solve(source.fit.covariance_m2, step)
-            inside.append(bool(distance < COVERAGE_95))
+            inside.append(bool(distance < CHI_SQUARED_95))
             level = 10.0 * np.log10(source.fit.power_1m)
             levels.append(float(level) - float(truth[match.id]["level_1m_db"]))
     return Outcome(
