@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from soundmap.logs.audio_messages import PACKET_READERS, block_samples
+from soundmap.logs.audio_messages import block_samples
 from soundmap.logs.audio_stream import AudioStream
 from soundmap.logs.reader import McapLog
 from soundmap.logs.records import Message
@@ -38,7 +38,6 @@ class BlockReader:
     ) -> None:
         self._decoders, self._stream = survey.decoders, stream
         self._channels, self._losses = channels, losses
-        self._read = PACKET_READERS[stream.topic.form]
         self._used = iter(stream.message.tolist())
         self._next_used = next(self._used, -1)
         self._message, self._block = -1, -1
@@ -53,7 +52,7 @@ class BlockReader:
         stream, clock = self._stream, self._stream.clock
         if not clock.kept[self._block]:
             return None
-        packet = self._read(self._decoders.decoder(message.channel)(message.data))
+        packet = self._decoders.reader(message.channel)(message.data)
         samples = block_samples(packet.data, stream.encoding, stream.sample)
         if len(self._channels) < stream.encoding.channels:
             samples = samples[:, self._channels]

@@ -168,17 +168,28 @@ def _checked(encoding: AudioEncoding) -> AudioEncoding:
     return encoding
 
 
+def frame_packet(
+    stamp_ns: int, frame_id: str, encoding: AudioEncoding, frames: int, data: Any
+) -> AudioPacket:
+    """A packet by what an ``AudioFrame`` tells of it.
+
+    Raises
+    ------
+    MessageError
+        The encoding makes no sense.
+    """
+    return AudioPacket(stamp_ns, frame_id, _checked(encoding), frames, None, data)
+
+
 def _audio_frame(message: Any) -> AudioPacket:
     encoding = AudioEncoding(
         message.format, int(message.channel_count), float(message.sampling_frequency)
     )
-    header = message.header
-    return AudioPacket(
-        ros_stamp_ns(header.stamp),
-        frame_name(header.frame_id),
-        _checked(encoding),
+    return frame_packet(
+        ros_stamp_ns(message.header.stamp),
+        frame_name(message.header.frame_id),
+        encoding,
         int(message.frame_sample_count),
-        None,
         message.data,
     )
 

@@ -41,6 +41,9 @@ LAST_TIME_NS = 2**62
 """The year 2116; what was logged later was not."""
 
 _MESSAGE = struct.Struct("<HIQQ")
+_MESSAGE_RECORD = struct.Struct("<BQHIQQ")
+"""A record's head and that of the message in it."""
+_IS_MESSAGE = int(Opcode.MESSAGE)  # compared a million times
 
 
 class FileWalk:
@@ -252,29 +255,30 @@ class FileWalk:
         """The wanted messages, the times of all, and the channels of all."""
         messages, times_ns, ids = list[Message](), list[int](), set[int]()
         position, end = 0, len(data)
-        read_head, head_size = RECORD_HEAD.unpack_from, RECORD_HEAD.size
-        read_message = _MESSAGE.unpack_from
-        while position + head_size <= end:
-            opcode, length = read_head(data, position)
-            start = position + head_size
+        read_message, selected = _MESSAGE_RECORD.unpack_from, self.selected
+        last_message = end - _MESSAGE_RECORD.size
+        while position + RECORD_HEAD.size <= end:
+            if position <= last_message:
+                opcode, length, channel_id, _, log_ns, published_ns = read_message(data, position)
+            else:
+                opcode, length = RECORD_HEAD.unpack_from(data, position)
+            start = position + RECORD_HEAD.size
             position = start + length
             if position > end:
                 self.log.count("record reaches beyond its chunk", self.file.name, "left out")
                 break
-            if opcode != 5 or length < 22:
+            if opcode != _IS_MESSAGE or length < _MESSAGE.size:
                 self._record(opcode, data[start:position], messages, times_ns)
                 continue
-            channel_id, _, log_time, publish_time = read_message(data, start)
             ids.add(channel_id)
             self.messages += 1
-            if not self._is_time(log_time):
+            if log_ns > LAST_TIME_NS and not self._is_time(log_ns):
                 continue
-            times_ns.append(log_time)
-            channel = self._selected(channel_id)
+            times_ns.append(log_ns)
+            channel = selected[channel_id] if channel_id in selected else self._selected(channel_id)
             if channel is not None:
-                messages.append(
-                    Message(channel, log_time, publish_time, data[start + 22 : position])
-                )
+                content = data[start + _MESSAGE.size : position]
+                messages.append(Message(channel, log_ns, published_ns, content))
         return messages, times_ns, {self.channels[i] for i in ids if i in self.channels}
 
 

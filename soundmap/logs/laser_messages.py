@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -54,41 +56,43 @@ def valid_ranges(sweep: LaserSweep) -> FloatArray:
 
     No return is what a scanner reports as NaN, infinite, nought, or outside its own limits.
     """
-    ranges = np.empty(len(sweep.ranges))
-    _returns(np.asarray(sweep.ranges), *_limits(sweep), ranges)
-    return ranges
+    return _returns(np.asarray(sweep.ranges), *_limits(sweep))
 
 
 def longest_return(sweep: LaserSweep) -> float:
     """Greatest of the valid ranges [m]; NaN if there is none."""
-    kept = np.empty(len(sweep.ranges))
-    return float(_returns(np.asarray(sweep.ranges), *_limits(sweep), kept))
+    return _longest(np.asarray(sweep.ranges), *_limits(sweep))
+
+
+# Compiled because numpy would let other threads go first after every step, thousands of times a
+# minute.
 
 
 @njit(cache=True)
-def _returns(ranges, low, high, kept):  # type: ignore[no-untyped-def]
-    """Keeps what is a return, else NaN; the greatest of them, NaN if there is none.
+def _returns(ranges, low, high):  # type: ignore[no-untyped-def]
+    """Keeps what is a return, else NaN."""
+    kept = np.empty(len(ranges))
+    for i in range(len(ranges)):
+        distance = ranges[i]
+        kept[i] = distance if distance > 0.0 and low <= distance < high else np.nan
+    return kept
 
-    Compiled because numpy would let other threads go first after every step, thousands of times
-    a minute.
-    """
+
+@njit(cache=True)
+def _longest(ranges, low, high):  # type: ignore[no-untyped-def]
     longest = np.nan
     for i in range(len(ranges)):
         distance = ranges[i]
-        if distance > 0.0 and low <= distance < high:
-            kept[i] = distance
-            if not distance <= longest:
-                longest = distance
-        else:
-            kept[i] = np.nan
+        if distance > 0.0 and low <= distance < high and not distance <= longest:
+            longest = distance
     return longest
 
 
 def _limits(sweep: LaserSweep) -> tuple[float, float]:
     """Least and greatest range that means a return [m]."""
-    low = max(sweep.range_min_m, 0.0) if np.isfinite(sweep.range_min_m) else 0.0
-    high = sweep.range_max_m if np.isfinite(sweep.range_max_m) else np.inf
-    return (low, high) if high > low else (0.0, np.inf)
+    low = max(sweep.range_min_m, 0.0) if math.isfinite(sweep.range_min_m) else 0.0
+    high = sweep.range_max_m if math.isfinite(sweep.range_max_m) else math.inf
+    return (low, high) if high > low else (0.0, math.inf)
 
 
 def _step(first: float, last: float, step: float, count: int) -> float:
@@ -103,25 +107,70 @@ def _are_angles(first: float, step: float, count: int) -> bool:
     return bool(np.isfinite(first) and np.isfinite(step)) and (step != 0.0 or count < 2)
 
 
-def _laser_scan(message: Any) -> LaserSweep:
-    first, last = float(message.angle_min), float(message.angle_max)
-    step = _step(first, last, float(message.angle_increment), len(message.ranges))
-    if not _are_angles(first, step, len(message.ranges)):
-        raise MessageError("laser scan without sound angles")
-    interval = float(message.time_increment)
-    told = (last - first) / step + 1.0 if step else np.nan
+def laser_sweep(
+    stamp_ns: int,
+    frame_id: str,
+    numbers: tuple[float, float, float, float, float, float],
+    ranges: Any,
+) -> LaserSweep:
+    """A sweep by what a ``LaserScan`` tells of it.
+
+    Parameters
+    ----------
+    stamp_ns : int
+    frame_id : str
+    numbers : tuple of float
+        Angles of the first and the last ray, angle and time between two rays, least and greatest
+        range.
+    ranges : array_like
+
+    Raises
+    ------
+    MessageError
+        The angles make no sense.
+    """
+    first, step, interval_s, least_m, greatest_m, told = _told(*numbers, len(ranges))
     return LaserSweep(
-        ros_stamp_ns(message.header.stamp),
-        frame_name(message.header.frame_id),
+        stamp_ns, frame_id, first, step, interval_s, least_m, greatest_m, ranges, told, None
+    )
+
+
+@lru_cache(maxsize=16)  # they hardly ever change from sweep to sweep
+def _told(
+    first: float,
+    last: float,
+    step: float,
+    interval_s: float,
+    least_m: float,
+    greatest_m: float,
+    count: int,
+) -> tuple[float, float, float, float, float, int]:
+    """First angle, step, ray interval, range limits, and how many beams there should be."""
+    step = _step(first, last, step, count)
+    if not _are_angles(first, step, count):
+        raise MessageError("laser scan without sound angles")
+    told = (last - first) / step + 1.0 if step else np.nan
+    return (
         first,
         step,
-        interval if np.isfinite(interval) else 0.0,
+        interval_s if np.isfinite(interval_s) else 0.0,
+        least_m,
+        greatest_m,
+        round(told) if 0.0 < told < 2**30 else count,
+    )
+
+
+def _laser_scan(message: Any) -> LaserSweep:
+    numbers = (
+        float(message.angle_min),
+        float(message.angle_max),
+        float(message.angle_increment),
+        float(message.time_increment),
         float(message.range_min),
         float(message.range_max),
-        message.ranges,
-        round(told) if 0.0 < told < 2**30 else len(message.ranges),
-        None,
     )
+    stamp_ns, frame_id = ros_stamp_ns(message.header.stamp), frame_name(message.header.frame_id)
+    return laser_sweep(stamp_ns, frame_id, numbers, message.ranges)
 
 
 def _angle_range_scan(message: Any) -> LaserSweep:

@@ -6,13 +6,13 @@ Some drivers fill only one of the two, and some publish NaN for the pose while t
 from __future__ import annotations
 
 from array import array
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from soundmap.geometry import FloatArray, Trajectory, composed, inverted, relative, wrapped_angle
-from soundmap.logs.messages import ros_stamp_ns
+from soundmap.logs.messages import frame_name, ros_stamp_ns
 from soundmap.logs.stamps import increasing
 from soundmap.losses import LossLedger
 
@@ -29,6 +29,38 @@ FEW_JUMPS = 0.05
 """... and steps that are too long must be rare."""
 
 
+class OdometryReading(NamedTuple):
+    """One odometry message.
+
+    Attributes
+    ----------
+    stamp_ns : int
+        0 if there is none.
+    parent, child : str
+        Frames.
+    numbers : tuple of float
+        Eleven: x, y, z [m], quaternion x, y, z, w, velocity x, y, z [m/s] and turn rate [rad/s] in
+        the base frame.
+    """
+
+    stamp_ns: int
+    parent: str
+    child: str
+    numbers: tuple[float, ...]
+
+
+def odometry_reading(message: Any) -> OdometryReading:
+    """What a decoded odometry message tells."""
+    p, q = message.pose.pose.position, message.pose.pose.orientation
+    v, w = message.twist.twist.linear, message.twist.twist.angular
+    return OdometryReading(
+        ros_stamp_ns(message.header.stamp),
+        frame_name(message.header.frame_id),
+        frame_name(message.child_frame_id),
+        (p.x, p.y, p.z, q.x, q.y, q.z, q.w, v.x, v.y, v.z, w.z),
+    )
+
+
 class OdometryRecord:
     """Odometry messages of one topic as they come, compactly.
 
@@ -36,8 +68,7 @@ class OdometryRecord:
     ----------
     stamp_ns, log_time_ns : array of int
     numbers : array of float
-        Eleven a message: x, y, z [m], quaternion x, y, z, w, velocity x, y, z [m/s] and turn rate
-        [rad/s] in the base frame.
+        Eleven a message: those of `OdometryReading`.
     parent, child : str
         Frames named by the first message.
     """
@@ -48,18 +79,11 @@ class OdometryRecord:
         self.numbers = array("d")
         self.parent, self.child = parent, child
 
-    def add_message(self, message: Any, log_time_ns: int) -> None:
+    def add(self, reading: OdometryReading, log_time_ns: int) -> None:
         """Take in an odometry message."""
         if not self.stamp_ns:
-            self.parent = message.header.frame_id.removeprefix("/")
-            self.child = message.child_frame_id.removeprefix("/")
-        p, q = message.pose.pose.position, message.pose.pose.orientation
-        v, w = message.twist.twist.linear, message.twist.twist.angular
-        self._add(
-            ros_stamp_ns(message.header.stamp),
-            log_time_ns,
-            (p.x, p.y, p.z, q.x, q.y, q.z, q.w, v.x, v.y, v.z, w.z),
-        )
+            self.parent, self.child = reading.parent, reading.child
+        self._add(reading.stamp_ns, log_time_ns, reading.numbers)
 
     def add_transform(self, stamp_ns: int, log_time_ns: int, pose: tuple[float, ...]) -> None:
         """Take in a transform: x, y, z and quaternion; there is no twist."""

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 
-@dataclass(frozen=True)
-class Channel:
+class Channel(NamedTuple):
     """Where messages of one topic come from and how they are encoded.
 
     Attributes
@@ -25,7 +23,7 @@ class Channel:
     encoding: str
     schema_name: str
     schema_encoding: str
-    schema_data: bytes = field(repr=False)
+    schema_data: bytes
 
 
 class Message(NamedTuple):

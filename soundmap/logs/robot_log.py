@@ -21,7 +21,7 @@ from soundmap.logs.array_health import array_health, without_faulty
 from soundmap.logs.audio_blocks import BlockReader, audio_blocks
 from soundmap.logs.audio_stream import AudioStream, audio_stream, microphone_array
 from soundmap.logs.coverage import count_silences
-from soundmap.logs.laser_messages import SWEEP_READERS, LaserSweep, valid_ranges
+from soundmap.logs.laser_messages import LaserSweep, valid_ranges
 from soundmap.logs.log_files import log_files
 from soundmap.logs.reader import McapLog
 from soundmap.logs.stamps import DAMAGED
@@ -130,7 +130,7 @@ class RobotLog:
             time_ns = reader.next_time()
             if time_ns == DAMAGED:
                 continue
-            scan = reader.scan(decoders.decoder(message.channel)(message.data), time_ns)
+            scan = reader.scan(decoders.reader(message.channel)(message.data), time_ns)
             heapq.heappush(waiting, (scan.time_ns, scan.scanner, scan))
             if len(waiting) > room:
                 yield heapq.heappop(waiting)[2]
@@ -143,7 +143,6 @@ class _ScanReader:
 
     def __init__(self, stream: LaserStream, scanner: int) -> None:
         self.stream, self.scanner = stream, scanner
-        self._read = SWEEP_READERS[stream.topic.form]
         self._times = iter(stream.time_ns.tolist())
         self._bearings: dict[tuple[float, float, int], FloatArray] = {}
         self._mounts: dict[Any, Mount] = {}
@@ -151,8 +150,7 @@ class _ScanReader:
     def next_time(self) -> int:
         return next(self._times, DAMAGED)
 
-    def scan(self, decoded: Any, time_ns: int) -> LaserScan:
-        sweep = self._read(decoded)
+    def scan(self, sweep: LaserSweep, time_ns: int) -> LaserScan:
         ranges = valid_ranges(sweep)
         limit = sweep.range_max_m
         known = np.isfinite(limit) and limit > max(sweep.range_min_m, 0.0)

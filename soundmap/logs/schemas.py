@@ -45,11 +45,16 @@ class MessageType:
         ``MessageError`` for a damaged message.
     built_in : bool
         The log holds no definition; a well-known one of that name is used.
+    layout : tuple of str
+        What a CDR message is made of, in order: path and type of every number and string, and of
+        every list of them, with its length if that is fixed. A list of structures is followed by
+        what one of them is made of. Empty for other encodings.
     """
 
     fields: Mapping[str, str]
     decoder: Callable[[], Decoder]
     built_in: bool = False
+    layout: tuple[str, ...] = ()
 
     def has(self, *paths: str) -> bool:
         """Whether all these fields are there."""
@@ -128,7 +133,8 @@ def _ros_type(channel: Channel) -> MessageType:
 
         return decoded
 
-    return MessageType(fields, decoder, built_in)
+    layout = () if ros1 else tuple(_layout(definitions, name, "", 0))
+    return MessageType(fields, decoder, built_in, layout)
 
 
 def _unpacked(data: memoryview) -> memoryview:
@@ -222,6 +228,24 @@ def _ros_fields(
             yield path, f"{inner}[]" if listed else inner
             if depth < MAX_DEPTH:
                 yield from _ros_fields(definitions, inner, f"{path}.", depth + 1)
+
+
+def _layout(definitions: Mapping[str, Any], name: str, prefix: str, depth: int) -> Iterator[str]:
+    from rosbags.interfaces import Nodetype
+
+    for field, kind in definitions[name][1]:
+        path, suffix = f"{prefix}{field}", ""
+        if kind[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+            suffix = f"[{kind[1][1]}]" if kind[0] == Nodetype.ARRAY else "[]"
+        inner = _referred(kind)
+        if inner is None:
+            leaf = kind[1][0][1] if suffix else kind[1]
+            yield f"{path} {leaf[0]}{suffix}"
+            continue
+        if suffix:
+            yield f"{path} {suffix}"
+        if depth < MAX_DEPTH:
+            yield from _layout(definitions, inner, f"{path}.", depth + 1)
 
 
 # Protocol Buffers

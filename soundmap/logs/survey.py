@@ -6,28 +6,28 @@ the stream; of odometry and transforms, which are small, everything.
 
 from __future__ import annotations
 
+import math
 from array import array
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
 from soundmap.logs.audio_messages import (
-    PACKET_READERS,
     AudioEncoding,
     AudioFormatError,
+    AudioPacket,
     info_encoding,
 )
-from soundmap.logs.laser_messages import SWEEP_READERS, LaserSweep, longest_return
+from soundmap.logs.decoders import Decoders
+from soundmap.logs.laser_messages import LaserSweep, longest_return
 from soundmap.logs.messages import KINDS, Form, Kind, form_of
 from soundmap.logs.odometry import OdometryRecord
 from soundmap.logs.reader import McapLog
 from soundmap.logs.records import Channel, Message
-from soundmap.logs.schemas import Decoder, MessageError, MessageType, SchemaError, message_type
+from soundmap.logs.schemas import Decoder, MessageError, SchemaError
 from soundmap.logs.stamps import DAMAGED
-from soundmap.logs.transforms import TRANSFORM_READERS, TransformRecord
+from soundmap.logs.transforms import Transform, TransformRecord
 from soundmap.losses import LossLedger
 
 _ATTRIBUTE_FAULTS = (MessageError, AttributeError, TypeError, ValueError, OverflowError, IndexError)
@@ -56,9 +56,8 @@ class AudioRecord:
     probe_step: int = 1
     judged_ns: int = 0
 
-    def add(self, decoded: Any, log_time_ns: int) -> None:
-        """Take in a message; MessageError if it makes no sense."""
-        packet = PACKET_READERS[self.form](decoded)
+    def add(self, packet: AudioPacket, log_time_ns: int) -> None:
+        """Take in a message."""
         self._probe(packet.data)
         if packet.encoding not in self.encodings:
             self.encodings.append(packet.encoding)
@@ -104,7 +103,6 @@ class LaserRecord:
     without any return were logged.
     """
 
-    form: Form
     topic: str
     losses: LossLedger
     stamp_ns: array[int] = field(default_factory=lambda: array("q"))
@@ -117,9 +115,8 @@ class LaserRecord:
     longest_m: float = 0.0
     any_return: bool = False
 
-    def add(self, decoded: Any, log_time_ns: int) -> None:
-        """Take in a message; MessageError if it makes no sense."""
-        sweep = SWEEP_READERS[self.form](decoded)
+    def add(self, sweep: LaserSweep, log_time_ns: int) -> None:
+        """Take in a message."""
         if not len(sweep.ranges):
             what = "laser scan without ranges"
             self.losses.add(what, self.topic, effect="left out", time_ns=log_time_ns)
@@ -128,10 +125,10 @@ class LaserRecord:
         if self.first is None:
             self.first, self.beams = sweep._replace(ranges=()), len(sweep.ranges)
         longest_m = longest_return(sweep)
-        if np.isnan(longest_m):
+        if math.isnan(longest_m):
             self.empty_ns.append(log_time_ns)
         else:
-            unlimited = not np.isfinite(sweep.range_max_m) or sweep.range_max_m <= 0.0
+            unlimited = not math.isfinite(sweep.range_max_m) or sweep.range_max_m <= 0.0
             if unlimited or not self.any_return:
                 self.longest_m = max(self.longest_m, longest_m)
             self.any_return = True
@@ -173,47 +170,15 @@ class Topic:
         """What the topic carries."""
         return KINDS[self.form]
 
-
-class Decoders:
-    """Type and decoder of every channel, made once for each definition."""
-
-    def __init__(self) -> None:
-        self._types: dict[tuple[str, ...] | bytes, MessageType | SchemaError] = {}
-        self._decoders: dict[Any, Decoder] = {}
-
-    def type_of(self, channel: Channel) -> MessageType:
-        """Fields of the channel's messages; SchemaError if they cannot be read."""
-        key: Any = self._key(channel)
-        if key not in self._types:
-            try:
-                self._types[key] = message_type(channel)
-            except SchemaError as error:
-                self._types[key] = error
-        found = self._types[key]
-        if isinstance(found, SchemaError):
-            raise found
-        return found
-
-    def decoder(self, channel: Channel) -> Decoder:
-        """What decodes the channel's messages; SchemaError if they cannot be read."""
-        key = self._key(channel)
-        if key not in self._decoders:
-            kind = self.type_of(channel)
-            try:
-                self._decoders[key] = kind.decoder()
-            except Exception as error:
-                # Code is generated from a definition that may be anything.
-                raise SchemaError(f"no decoder for {channel.schema_name} ({error})") from None
-        return self._decoders[key]
-
-    @staticmethod
-    def _key(channel: Channel) -> Any:
-        return (
-            channel.encoding,
-            channel.schema_name,
-            channel.schema_encoding,
-            channel.schema_data,
-        )
+    def count(self, log_time_ns: int) -> None:
+        """Count a message."""
+        if not self.messages:
+            self.first_ns = self.last_ns = log_time_ns
+        elif log_time_ns > self.last_ns:
+            self.last_ns = log_time_ns
+        elif log_time_ns < self.first_ns:
+            self.first_ns = log_time_ns
+        self.messages += 1
 
 
 class Survey:
@@ -280,7 +245,7 @@ class Survey:
             channel.topic, Topic(channel.topic, channel.schema_name, channel.encoding)
         )
         take: Callable[[Any, int], None] | None = None
-        decode: Decoder | None = None
+        read: Decoder | None = None
         try:
             kind = self.decoders.type_of(channel)
             form = form_of(kind)
@@ -288,23 +253,20 @@ class Survey:
                 topic.form, topic.built_in = form, kind.built_in
             if form is topic.form:
                 take = self._take(topic)
-                decode = self.decoders.decoder(channel) if take else None
+                read = self.decoders.reader(channel) if take else None
         except SchemaError as error:
             topic.problem = str(error).splitlines()[0]
 
         def taker(message: Message) -> None:
             time = message.log_time_ns
-            if not topic.messages:
-                topic.first_ns = topic.last_ns = time
-            topic.messages += 1
-            topic.first_ns, topic.last_ns = min(topic.first_ns, time), max(topic.last_ns, time)
+            topic.count(time)
             if self._keep_times:
                 topic.logged_ns.append(time)
-            if take is None or decode is None:
+            if take is None or read is None:
                 self._skip(topic, time)
                 return
             try:
-                take(decode(message.data), time)
+                take(read(message.data), time)
             except _ATTRIBUTE_FAULTS:
                 what = f"damaged {topic.kind} message"
                 self.losses.add(what, topic.name, effect="left out", time_ns=time)
@@ -326,12 +288,12 @@ class Survey:
             return topic.record.add
         if topic.kind is Kind.LASER:
             if not isinstance(topic.record, LaserRecord):
-                topic.record = LaserRecord(topic.form, topic.name, self.losses)
+                topic.record = LaserRecord(topic.name, self.losses)
             return topic.record.add
         if topic.kind is Kind.ODOMETRY:
             if not isinstance(topic.record, OdometryRecord):
                 topic.record = OdometryRecord()
-            return topic.record.add_message
+            return topic.record.add
         if topic.kind is Kind.TRANSFORMS:
             return self._transform_taker(topic)
         if topic.kind is Kind.AUDIO_INFO:
@@ -339,11 +301,10 @@ class Survey:
         return None
 
     def _transform_taker(self, topic: Topic) -> Callable[[Any, int], None]:
-        reader = TRANSFORM_READERS[topic.form]
         static = topic.name.rstrip("/").endswith("static")
 
-        def take(decoded: Any, time: int) -> None:
-            self.transforms.add(topic.name, reader(decoded), time, static=static)
+        def take(transforms: list[Transform], time: int) -> None:
+            self.transforms.add(topic.name, transforms, time, static=static)
 
         return take
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
-
-import numpy as np
 
 from soundmap.geometry import Mount
 from soundmap.logs.messages import Form, frame_name, ros_stamp_ns, timestamp_ns
@@ -24,18 +23,17 @@ def _pose(translation: Any, rotation: Any) -> tuple[float, ...]:
     return (t.x, t.y, t.z, r.x, r.y, r.z, r.w)
 
 
-def _stamped_transforms(message: Any) -> Iterator[Transform]:
-    for item in message.transforms:
-        yield (
-            frame_name(item.header.frame_id),
-            frame_name(item.child_frame_id),
-            ros_stamp_ns(item.header.stamp),
-            _pose(item.transform.translation, item.transform.rotation),
-        )
+def _stamped_transform(item: Any) -> Transform:
+    return (
+        frame_name(item.header.frame_id),
+        frame_name(item.child_frame_id),
+        ros_stamp_ns(item.header.stamp),
+        _pose(item.transform.translation, item.transform.rotation),
+    )
 
 
-def _frame_transform(item: Any) -> Iterator[Transform]:
-    yield (
+def _frame_transform(item: Any) -> Transform:
+    return (
         frame_name(item.parent_frame_id),
         frame_name(item.child_frame_id),
         timestamp_ns(item.timestamp),
@@ -43,15 +41,10 @@ def _frame_transform(item: Any) -> Iterator[Transform]:
     )
 
 
-def _frame_transforms(message: Any) -> Iterator[Transform]:
-    for item in message.transforms:
-        yield from _frame_transform(item)
-
-
-TRANSFORM_READERS: dict[Form, Callable[[Any], Iterator[Transform]]] = {
-    Form.STAMPED_TRANSFORMS: _stamped_transforms,
-    Form.FRAME_TRANSFORM: _frame_transform,
-    Form.FRAME_TRANSFORMS: _frame_transforms,
+TRANSFORM_READERS: dict[Form, Callable[[Any], list[Transform]]] = {
+    Form.STAMPED_TRANSFORMS: lambda message: [_stamped_transform(t) for t in message.transforms],
+    Form.FRAME_TRANSFORM: lambda message: [_frame_transform(message)],
+    Form.FRAME_TRANSFORMS: lambda message: [_frame_transform(t) for t in message.transforms],
 }
 """What turns a decoded message of each layout into transforms."""
 
@@ -95,11 +88,13 @@ class TransformRecord:
         self.edges: dict[tuple[str, str], Edge] = {}
 
     def add(
-        self, topic: str, transforms: Iterator[Transform], log_time_ns: int, *, static: bool
+        self, topic: str, transforms: Iterable[Transform], log_time_ns: int, *, static: bool
     ) -> None:
         """Take in the transforms of one message."""
         for parent, child, stamp_ns, pose in transforms:
-            edge = self.edges.setdefault((parent, child), Edge(topic))
+            edge = self.edges.get((parent, child))
+            if edge is None:
+                edge = self.edges[parent, child] = Edge(topic)
             if not static:
                 edge.record.parent, edge.record.child = parent, child
                 edge.record.add_transform(stamp_ns, log_time_ns, pose)
@@ -133,4 +128,4 @@ def _differ(a: tuple[float, ...], b: tuple[float, ...]) -> bool:
 
 
 def _sound(pose: tuple[float, ...]) -> bool:
-    return bool(np.all(np.isfinite(pose))) and sum(q * q for q in pose[3:]) > MIN_QUATERNION_NORM**2
+    return all(map(math.isfinite, pose)) and sum(q * q for q in pose[3:]) > MIN_QUATERNION_NORM**2
