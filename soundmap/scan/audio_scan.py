@@ -22,15 +22,14 @@ from soundmap.config import ScanConfig
 from soundmap.geometry import FloatArray, Mount
 from soundmap.losses import LossLedger
 from soundmap.scan.cross_spectra import BaselineSpectra
-from soundmap.scan.response import steered_response_power, whitened_spectra
+from soundmap.scan.response import steered_response_power, whitening
 from soundmap.scan.spectrum import Framing, band_bins, hann_power
 from soundmap.scan.steering import SteeringTable, steering_table
 from soundmap.sensors import AudioBlock, MicArray
 from soundmap.sound import REFERENCE_PRESSURE_PA, AudioScan, AudioScans, LevelReference
 
 BATCH = 32
-"""Scans that are steered by one matrix product; a shorter batch is filled up with nothing, so that
-no scan's rounding depends on how many follow it."""
+"""Scans that are steered at a time: so often is each number of the steering table used."""
 BATCH_BYTES = 2**24
 """... but fewer where an array has so many baselines that their cross-spectra exceed this."""
 
@@ -263,45 +262,41 @@ class _Scanner:
         """
         spectra, finite = self._spectra(samples, len(time_ns))
         with np.errstate(invalid="ignore", over="ignore"):
-            raw = self._steered(spectra, finite)
+            weight = whitening(spectra, self.table) if self.sharp else None
+            raw, white = steered_response_power(spectra, self.table, weight)
+            raw[~finite] = np.nan
             norm = self.framing.frames * hann_power(self.framing.window) * self.microphones**2
-            power = raw.astype(np.float64) * (self.square_of_unit / norm)
-            sharp = None
-            if self.sharp:
-                white = self._steered(whitened_spectra(spectra, self.table), finite)
-                sharp = white / np.float32(self.microphones)
+            sub_bands = raw.astype(np.float64) * (self.square_of_unit / norm)
+            power = sub_bands.sum(axis=1)
+            sub_bands = sub_bands.astype(np.float32)
+            white = white / np.float32(self.microphones)
         return [
             AudioScan(
                 time,
                 self.table.bearing_rad,
-                power[i].sum(axis=0),
-                None if sharp is None else sharp[i].sum(axis=0),
-                power[i].astype(np.float32),
+                power[i],
+                white[i] if self.sharp else None,
+                sub_bands[i],
             )
             for i, time in enumerate(time_ns)
         ]
 
-    def _steered(
-        self, spectra: NDArray[np.float32], finite: NDArray[np.bool_]
-    ) -> NDArray[np.float32]:
-        """Power of each sub-band on every bearing of the scans of a batch, (scans, B, N)."""
-        power = steered_response_power(spectra, self.table)[: len(finite)]
-        power[~finite] = np.nan
-        return power
-
     def _spectra(
         self, samples: NDArray[Any], scans: int
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Cross-spectra of a whole batch, of which so many scans are filled and maybe finite."""
-        if not hasattr(self._own, "spectra"):  # each thread has memory of its own
-            self._own.spectra = BaselineSpectra(self.microphones, self.framing, self.table)
-        spectra = np.zeros((self.batch, *self.table.spectra_shape), dtype=np.float32)
+        """Cross-spectra of so many scans, and which of them are finite; the others are nought."""
+        own = self._own  # each thread has memory of its own
+        if not hasattr(own, "maker"):
+            own.maker = BaselineSpectra(self.microphones, self.framing, self.table)
+            own.spectra = np.empty((self.batch, *self.table.spectra_shape), dtype=np.float32)
+        spectra = own.spectra[:scans]
         finite = np.zeros(scans, dtype=bool)
         with np.errstate(invalid="ignore", over="ignore"):
             for i in range(scans):
                 start = i * self.framing.advance
                 excerpt = samples[start : start + self.framing.span]
-                finite[i] = self._own.spectra.add(excerpt, spectra[i])
+                finite[i] = own.maker.add(excerpt, spectra[i])
+        spectra[~finite] = 0.0
         return spectra, finite
 
 

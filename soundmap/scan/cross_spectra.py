@@ -1,9 +1,9 @@
-r"""Cross-spectra of an audio scan, summed over its frames and over the pairs of each baseline.
+r"""Cross-spectra of audio scans, summed over frames and over the pairs of each baseline.
 
 All that steering needs to know of the sound: with :math:`R_{mn} = \sum_f V_{m,f} V_{n,f}^*`, the
 sum of :math:`R_{mn}` over the pairs (m, n) of a baseline. Samples stay as recorded, channels side
-by side: two real channels are transformed as one complex, and told apart in the few bins of the
-band, where the Hann window is applied too. Beside the compiled form stands one in plain numpy.
+by side, while they are transformed; then bins take their place, for products of any two channels.
+Beside the compiled form stands one in plain numpy.
 """
 
 from __future__ import annotations
@@ -11,15 +11,26 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import scipy.fft
 from numba import njit
 from numpy.typing import NDArray
 
+from soundmap.scan.lanes import (
+    LANES,
+    constant,
+    lanes_array,
+    load,
+    minus_product,
+    plus_product,
+    store,
+    transpose,
+    whole_lanes,
+)
 from soundmap.scan.spectrum import Band, Framing, band_spectrum, cross_spectral_matrix
-from soundmap.scan.steering import LANES, SteeringTable
+from soundmap.scan.steering import SteeringTable
+from soundmap.scan.transform import ROW, transform, transform_plan
 
-_QUARTER = np.float32(0.25)
-_EIGHTH = np.float32(0.125)
+_ROWS_A_SUM = 64
+"""Samples that are summed in single precision; sums of many would lose digits."""
 
 
 class BaselineSpectra:
@@ -34,17 +45,16 @@ class BaselineSpectra:
     """
 
     def __init__(self, microphones: int, framing: Framing, table: SteeringTable) -> None:
-        self._table = table
-        even = microphones + microphones % 2  # a silent channel makes the last one a pair
-        self._centred = np.zeros((framing.span, even), dtype=np.float32)
-        pairs = self._centred.view(np.complex64)
-        step = pairs.strides[0]
-        self._frames = np.lib.stride_tricks.as_strided(
-            pairs,
-            (framing.frames, even // 2, framing.window),
-            (framing.hop * step, pairs.strides[1], step),
-            writeable=False,
-        )
+        bins, baselines = table.spectra_shape[1:]
+        lanes = whole_lanes(microphones)
+        self._framing = framing
+        self._plan = transform_plan(framing.window, table.first_bin - 1, bins + 2)
+        self._samples = lanes_array(framing.span, lanes)
+        # Rows behind the band's last stay 0: bins are worked on in whole lanes.
+        self._spectrum = lanes_array(framing.frames, whole_lanes(bins) + 2, ROW)
+        self._parts = lanes_array(whole_lanes(bins) // LANES, lanes, framing.frames, ROW)
+        self._sums = lanes_array(2, baselines, LANES)
+        self._pairs = _pairs_by_baseline(table, self._parts[0, 0].size)
 
     def add(self, samples: NDArray[Any], spectra: NDArray[np.float32]) -> bool:
         """Writes the cross-spectra of one scan.
@@ -53,7 +63,7 @@ class BaselineSpectra:
         ----------
         samples : ndarray, shape (span, Q)
             In whatever type they were recorded.
-        spectra : ndarray of float32, shape (2, M, B, LANES)
+        spectra : ndarray of float32, shape (2, K, B)
             Where real and imaginary parts go, as `SteeringTable.spectra_shape` says; unchanged if
             the samples are not finite.
 
@@ -62,14 +72,23 @@ class BaselineSpectra:
         bool
             Whether all samples are finite.
         """
-        if not _centre(samples, self._centred):
+        mean = _as_lanes(np.ascontiguousarray(samples), self._samples)
+        if not np.all(np.isfinite(mean)):
             return False
-        spectrum = scipy.fft.fft(self._frames, axis=2)
-        lines = self._table.baselines
-        _add_spectra(
-            spectrum, self._table.block_bin, lines.first, lines.second, lines.baseline, spectra
-        )
+        hop = self._framing.hop
+        _write_parts(self._samples, hop, mean, self._plan, self._spectrum, self._parts)
+        _write_sums(self._parts, *self._pairs, self._sums, spectra)
         return True
+
+
+def _pairs_by_baseline(
+    table: SteeringTable, channel_size: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """First pair of each baseline and behind the last; where a pair's two channels begin."""
+    lines = table.baselines
+    starts = np.searchsorted(lines.baseline, np.arange(len(lines) + 1)).astype(np.intp)
+    first, second = (channel_size * side.astype(np.intp) for side in (lines.first, lines.second))
+    return starts, first, second
 
 
 def baseline_spectra_plain(
@@ -88,94 +107,92 @@ def baseline_spectra_plain(
 
     Returns
     -------
-    ndarray, shape (2, M, B, LANES)
-        0 in the lanes without weight.
+    ndarray, shape (2, K, B)
     """
     matrix = cross_spectral_matrix(band_spectrum(channels, framing, band))
     lines = table.baselines
     summed = np.zeros((len(band), len(lines)), dtype=matrix.dtype)
     np.add.at(summed.T, lines.baseline, matrix[:, lines.first, lines.second].T)
-    spectra = np.zeros(table.spectra_shape, dtype=matrix.real.dtype)
-    ends = np.append(table.block_bin[1:], band.first + len(band))
-    for block, (start, end) in enumerate(zip(table.block_bin, ends, strict=True)):
-        part = summed[start - band.first : end - band.first].T
-        spectra[0, block, :, : part.shape[1]] = part.real
-        spectra[1, block, :, : part.shape[1]] = part.imag
-    return spectra
+    return np.stack([summed.real, summed.imag])
 
 
 @njit(cache=True, nogil=True)
-def _centre(samples, centred):  # type: ignore[no-untyped-def]
-    """Samples (T, Q) less the mean of their channel; False and nothing done if not finite."""
+def _as_lanes(samples, lanes):  # type: ignore[no-untyped-def]
+    """Samples (T, Q) in whole lanes; their mean, shape (1, lanes), not finite if one is not."""
     length, channels = samples.shape
-    total = np.zeros(channels)
-    for t in range(length):
-        for q in range(channels):
-            total[q] += np.float32(samples[t, q])
-    mean = np.empty(channels, dtype=np.float32)
-    for q in range(channels):
-        mean[q] = total[q] / length
-        if not np.isfinite(mean[q]):
-            return False
-    for t in range(length):
-        for q in range(channels):
-            centred[t, q] = np.float32(samples[t, q]) - mean[q]
-    return True
+    width = lanes.shape[1]
+    if channels == width:  # nothing to insert: one long loop, not many short ones
+        source, target = samples.reshape(-1), lanes.reshape(-1)
+        for i in range(len(target)):
+            target[i] = np.float32(source[i])
+    else:
+        for t in range(length):
+            for q in range(channels):
+                lanes[t, q] = np.float32(samples[t, q])
+    total = np.zeros(width)
+    part = np.empty(LANES, dtype=np.float32)
+    for lane in range(0, width, LANES):
+        for first in range(0, length, _ROWS_A_SUM):
+            summed = constant(0.0)
+            for t in range(first, min(first + _ROWS_A_SUM, length)):
+                summed = summed + load(lanes, t * width + lane)
+            store(part, 0, summed)
+            for i in range(LANES):
+                total[lane + i] += part[i]
+    return (total / length).astype(np.float32)
 
 
 @njit(cache=True, nogil=True)
-def _add_spectra(spectrum, block_bin, first, second, baseline, spectra):  # type: ignore[no-untyped-def]
-    """Cross-spectra (2, M, B, LANES) of the spectra (F, Q / 2, L) of pairs of channels."""
-    frames, pairs, _ = spectrum.shape
-    parts = np.empty((frames, 2 * pairs, 2 * LANES), dtype=np.float32)
-    sums = np.empty((spectra.shape[2], 2 * LANES), dtype=np.float32)
-    for block in range(len(block_bin)):
-        _windowed_parts(spectrum, block_bin[block] - 1, parts)
-        _sum_products(parts, first, second, baseline, sums)
-        spectra[0, block] = sums[:, :LANES]
-        spectra[1, block] = sums[:, LANES:]
+def _write_parts(samples, hop, mean, plan, spectrum, parts):  # type: ignore[no-untyped-def]
+    """Real and imaginary parts (K / LANES, Q, F, ROW) of Hann-windowed spectra, from samples.
 
-
-@njit(cache=True, nogil=True, fastmath={"contract", "nsz"})
-def _windowed_parts(spectrum, start, parts):  # type: ignore[no-untyped-def]
-    """Real and imaginary parts (F, Q, 2 LANES) of each channel, the Hann window applied.
-
-    Of the bins that follow ``start``. With Z the spectrum of two channels as one and Z' that at
-    the mirrored bins, they are (Z + Z'*) / 2 and (Z - Z'*) / 2j.
+    The window of one period of a cosine is three taps on the bins: see
+    :func:`~soundmap.scan.spectrum.band_spectrum`.
     """
-    frames, pairs, length = spectrum.shape
-    near = np.empty((4, LANES + 2), dtype=np.float32)
-    for f in range(frames):
-        for p in range(pairs):
-            k = start % length
-            for j in range(LANES + 2):
-                mirror = length - k if k > 0 else 0
-                near[0, j] = spectrum[f, p, k].real
-                near[1, j] = spectrum[f, p, k].imag
-                near[2, j] = spectrum[f, p, mirror].real
-                near[3, j] = spectrum[f, p, mirror].imag
-                k = k + 1 if k + 1 < length else 0
-            for j in range(LANES):
-                a = _QUARTER * near[0, j + 1] - _EIGHTH * (near[0, j] + near[0, j + 2])
-                b = _QUARTER * near[1, j + 1] - _EIGHTH * (near[1, j] + near[1, j + 2])
-                c = _QUARTER * near[2, j + 1] - _EIGHTH * (near[2, j] + near[2, j + 2])
-                d = _QUARTER * near[3, j + 1] - _EIGHTH * (near[3, j] + near[3, j + 2])
-                parts[f, 2 * p, j] = a + c
-                parts[f, 2 * p, LANES + j] = b - d
-                parts[f, 2 * p + 1, j] = b + d
-                parts[f, 2 * p + 1, LANES + j] = c - a
+    width = samples.shape[1]
+    blocks, _, frames, _ = parts.shape
+    half, quarter = constant(0.5), constant(0.25)
+    tile = np.empty((2, LANES, LANES), dtype=np.float32)
+    for group in range(0, width, LANES):
+        transform(samples, group, width, hop * width, load(mean, group), plan, spectrum)
+        for f in range(frames):
+            frame = f * spectrum[0].size
+            for block in range(blocks):
+                for bin_ in range(LANES):
+                    at = frame + ROW * (block * LANES + bin_ + 1)
+                    for part in range(2):
+                        beside = load(spectrum, at - ROW) + load(spectrum, at + ROW)
+                        windowed = minus_product(half * load(spectrum, at), quarter, beside)
+                        store(tile, (part * LANES + bin_) * LANES, windowed)
+                        at += LANES
+                to = ((block * width + group) * frames + f) * ROW
+                transpose(tile, 0, parts, to, frames * ROW)
+                transpose(tile, LANES * LANES, parts, to + LANES, frames * ROW)
 
 
-@njit(cache=True, nogil=True, fastmath={"contract", "nsz"})
-def _sum_products(parts, first, second, baseline, sums):  # type: ignore[no-untyped-def]
-    """Sums (B, 2 LANES) over frames and pairs of one part times the other's conjugate."""
-    sums[:] = 0.0
-    for f in range(len(parts)):
-        part = parts[f]
-        for i in range(len(first)):
-            m, n, b = first[i], second[i], baseline[i]
-            for j in range(LANES):
-                sums[b, j] += part[m, j] * part[n, j] + part[m, LANES + j] * part[n, LANES + j]
-                sums[b, LANES + j] += (
-                    part[m, LANES + j] * part[n, j] - part[m, j] * part[n, LANES + j]
-                )
+@njit(cache=True, nogil=True)
+def _write_sums(parts, starts, first, second, sums, spectra):  # type: ignore[no-untyped-def]
+    """Sums (2, K, B) over frames and pairs of one channel times the other's conjugate."""
+    blocks, width, frames, _ = parts.shape
+    _, bins, baselines = spectra.shape
+    for block in range(blocks):
+        base = block * width * frames * ROW
+        for line in range(baselines):
+            re_re = im_im = im_re = re_im = constant(0.0)
+            for pair in range(starts[line], starts[line + 1]):
+                m, n = base + first[pair], base + second[pair]
+                for _ in range(frames):
+                    re, im = load(parts, m), load(parts, m + LANES)
+                    other_re, other_im = load(parts, n), load(parts, n + LANES)
+                    re_re = plus_product(re_re, re, other_re)
+                    im_im = plus_product(im_im, im, other_im)
+                    im_re = plus_product(im_re, im, other_re)
+                    re_im = plus_product(re_im, re, other_im)
+                    m += ROW
+                    n += ROW
+            store(sums, line * LANES, re_re + im_im)
+            store(sums, (baselines + line) * LANES, im_re - re_im)
+        for part in range(2):
+            for bin_ in range(min(LANES, bins - block * LANES)):
+                for line in range(baselines):
+                    spectra[part, block * LANES + bin_, line] = sums[part, line, bin_]

@@ -17,14 +17,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from soundmap.geometry import FloatArray
+from soundmap.scan.lanes import lanes_array
 
 PHASE_TOLERANCE_RAD = 1e-4
 """Baselines are one if merging them moves no phase by more than this. At 6 kHz that is 0.9 um
 about their mean: positions that a file gives in whole micrometres still merge."""
 
-
-LANES = 32
-"""Bins that are worked on at a time: enough to fill two of a processor's widest registers."""
+BEARINGS_A_TILE = 64
+"""Bearings that are steered at a time; tables are filled up to a multiple of them."""
 
 
 def scan_bearings(count: int) -> FloatArray:
@@ -89,8 +89,7 @@ class Baselines:
     first, second : ndarray of int, shape (P,)
         m and n of each pair. A pair that runs the other way is listed as (n, m).
     baseline : ndarray of int, shape (P,)
-        Which baseline each pair has. Neighbours in the list differ in it where they can, so that
-        a sum over pairs need not wait for its last term.
+        Which baseline each pair has; pairs of one follow one another.
     """
 
     vector_m: FloatArray
@@ -139,10 +138,7 @@ def distinct_baselines(positions_m: FloatArray, *, tolerance_m: float) -> Baseli
             pairs[group].append((m, n) if sign > 0 else (n, m))
     order = sorted(range(len(pairs)), key=lambda group: -len(pairs[group]))
     lists = [[(q, q) for q in range(count)], *(pairs[group] for group in order)]
-    depth = max(len(pairs) for pairs in lists)
-    table = [
-        (*pairs[i], b) for i in range(depth) for b, pairs in enumerate(lists) if i < len(pairs)
-    ]
+    table = [(*pair, line) for line, pairs in enumerate(lists) for pair in pairs]
     first, second, baseline = np.array(table, dtype=np.uintp).T.copy()
     return Baselines(np.vstack([np.zeros((1, 2)), means[order]]), first, second, baseline)
 
@@ -165,57 +161,49 @@ def _joined(
 
 
 @dataclass(frozen=True)
-class GroupTable:
-    """Weighted cosines and sines of the phase that each baseline has on each bearing, for a group.
-
-    Attributes
-    ----------
-    blocks : slice
-        Of the band's blocks of bins those that hold bins of the group.
-    cosine, sine : ndarray of float32, shape (N or N / 2, M, B, LANES)
-        For each of these M blocks the weight, for pairs of different microphones twice the weight,
-        times cos and sin; nought for bins of other groups. With an even N only the first half of
-        the bearings: the opposite bearing has the same cosine and the opposite sine.
-    """
-
-    blocks: slice
-    cosine: NDArray[np.float32]
-    sine: NDArray[np.float32]
-
-
-@dataclass(frozen=True)
 class SteeringTable:
-    """What it takes to steer the bins of a band, cut into blocks of `LANES`.
+    """What it takes to steer the bins of a band.
 
     Attributes
     ----------
     bearing_rad : ndarray, shape (N,)
         All bearings [rad].
     baselines : Baselines
-    block_bin : ndarray of int, shape (M,)
-        Lowest bin of each block.
-    weight : ndarray, shape (M, LANES)
-        What the square of each bin counts for; nought behind the band's last.
-    groups : tuple of GroupTable
-        One for each group of bins. A block may hold bins of several: cross-spectra cost more than
-        to steer some of them twice.
+    first_bin : int
+        Lowest bin of the band.
+    weight : ndarray, shape (K,)
+        What the square of each bin counts for.
+    group : ndarray of int, shape (K,)
+        Which group each bin is of; 0, 0, ..., 1, 1, ...
+    cosine, sine : ndarray of float32, shape (K, B, C)
+        The weight, for pairs of different microphones twice the weight, times cos and sin of the
+        phase that each baseline has on each bearing. With an even N only the first half of the
+        bearings: the opposite bearing has the same cosine and the opposite sine. The rest of the C,
+        a multiple of `BEARINGS_A_TILE`, is nought.
     """
 
     bearing_rad: FloatArray
     baselines: Baselines
-    block_bin: NDArray[np.intp]
+    first_bin: int
     weight: FloatArray
-    groups: tuple[GroupTable, ...]
+    group: NDArray[np.intp]
+    cosine: NDArray[np.float32]
+    sine: NDArray[np.float32]
+
+    @property
+    def groups(self) -> int:
+        """Groups of bins whose power is told apart."""
+        return int(self.group[-1]) + 1
 
     @property
     def halved(self) -> bool:
         """Whether the tables hold only the first half of the bearings."""
-        return len(self.groups[0].cosine) < len(self.bearing_rad)
+        return len(self.bearing_rad) % 2 == 0
 
     @property
-    def spectra_shape(self) -> tuple[int, int, int, int]:
-        """(2, M, B, LANES): real and imaginary parts of the cross-spectra of one scan."""
-        return (2, len(self.block_bin), len(self.baselines), LANES)
+    def spectra_shape(self) -> tuple[int, int, int]:
+        """(2, K, B): real and imaginary parts of the cross-spectra of one scan."""
+        return (2, len(self.weight), len(self.baselines))
 
 
 def steering_table(
@@ -255,30 +243,13 @@ def steering_table(
     baselines = distinct_baselines(positions_m, tolerance_m=tolerance_m)
     bearing = scan_bearings(bearings)
     kept = bearing if bearings % 2 else bearing[: bearings // 2]
-    block = np.arange(0, bins, LANES, dtype=np.intp)
-    lane = block[:, None] + np.arange(LANES)
-    blocked_weight = np.where(lane < bins, weight[np.minimum(lane, bins - 1)], 0.0)
-    blocked_wavenumber = wavenumber[np.minimum(lane, bins - 1)]
-    groups = []
-    for start, stop in pairwise(edges):
-        blocks = slice(start // LANES, (stop - 1) // LANES + 1)
-        own = (lane[blocks] >= start) & (lane[blocks] < stop)
-        part = np.where(own, blocked_weight[blocks], 0.0)
-        tables = _phase_tables(part, blocked_wavenumber[blocks], baselines, direction(kept))
-        groups.append(GroupTable(blocks, *tables))
-    return SteeringTable(bearing, baselines, first_bin + block, blocked_weight, tuple(groups))
-
-
-def _phase_tables(
-    weight: FloatArray, wavenumber: FloatArray, baselines: Baselines, toward: FloatArray
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Weight (M, LANES) times cosine and sine of each baseline's phase on each bearing (R, 2)."""
-    counts = np.where(np.arange(len(baselines)) == 0, 1.0, 2.0)
-    factor = weight[:, None, :] * counts[:, None]
-    cosine = np.empty((len(toward), *factor.shape), dtype=np.float32)
-    sine = np.empty_like(cosine)
-    for row, unit in enumerate(toward):  # one bearing at a time: tables can be large
-        phase = wavenumber[:, None, :] * (baselines.vector_m @ unit)[:, None]
-        cosine[row] = factor * np.cos(phase)
-        sine[row] = factor * np.sin(phase)
-    return cosine, sine
+    ahead_m = baselines.vector_m @ direction(kept).T
+    tiles = -(-len(kept) // BEARINGS_A_TILE)
+    cosine = lanes_array(bins, len(baselines), tiles * BEARINGS_A_TILE)
+    sine = lanes_array(*cosine.shape)
+    counts = np.where(np.arange(len(baselines)) == 0, 1.0, 2.0)[:, None]
+    for k in range(bins):  # one bin at a time: tables can be large
+        cosine[k, :, : len(kept)] = weight[k] * counts * np.cos(wavenumber[k] * ahead_m)
+        sine[k, :, : len(kept)] = weight[k] * counts * np.sin(wavenumber[k] * ahead_m)
+    group = np.searchsorted(edges[1:], np.arange(bins), side="right")
+    return SteeringTable(bearing, baselines, first_bin, weight, group, cosine, sine)

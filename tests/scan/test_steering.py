@@ -5,7 +5,7 @@ import pytest
 from plane_waves import circle, mic_array, scattered
 
 from soundmap.scan.steering import (
-    LANES,
+    BEARINGS_A_TILE,
     PHASE_TOLERANCE_RAD,
     distinct_baselines,
     scan_bearings,
@@ -97,8 +97,9 @@ def test_opposite_bearings_share_a_row(bearings, rows):
         weight=np.array([1.0, 2.0]),
         speed_of_sound_m_s=343.0,
     )
-    (group,) = table.groups
-    assert group.cosine.shape == group.sine.shape == (rows, 1, 1 + 9, LANES)
+    assert table.cosine.shape == table.sine.shape == (2, 1 + 9, BEARINGS_A_TILE)
+    assert np.all(table.cosine[:, 0, :rows] == np.array([[1.0], [2.0]]))
+    assert not table.cosine[:, :, rows:].any()
     assert table.halved is (bearings % 2 == 0)
     assert np.allclose(table.bearing_rad, scan_bearings(bearings))
     assert scan_bearings(bearings)[0] == 0.0
