@@ -18,7 +18,7 @@ from soundmap.deskew import Rays, deskewed_rays, interpolated_pose
 from soundmap.errors import NothingUsableError
 from soundmap.geometry import FloatArray, Trajectory, wrapped_angle
 from soundmap.losses import LossLedger
-from soundmap.mapping.surface_normals import surface_normals
+from soundmap.mapping.surface_lines import surface_lines
 from soundmap.sensors import LaserScan
 from soundmap.standstill import StandstillWitness, compared_ranges, has_moved
 
@@ -70,7 +70,8 @@ class KeyScan:
     turned_rad : float
         Angle turned up to then, left and right added up [rad].
     origin_m, end_m : ndarray of float32, shapes (P, 2)
-        Where rays started and met a surface, in the base frame [m].
+        Where rays started and met a surface, in the base frame [m]; the noise across the surface
+        taken out by the returns around.
     normal : ndarray of float32, shape (P, 2)
         Unit normal of the surface in the base frame, towards the scanner; zero if unknown.
     """
@@ -247,14 +248,14 @@ class _Place:
 
 
 def _thinned(rays: Rays, most: int, spacing_m: float) -> dict[str, Float32Array]:
-    """Returns spread over the surfaces and ordered by x, normals taken from all of them."""
-    normal = surface_normals(rays.origin_m, rays.end_m)
-    cell = np.floor(rays.end_m / spacing_m).astype(np.int64)
+    """Returns laid on their surfaces, spread over them and ordered by x."""
+    normal, point = surface_lines(rays.origin_m, rays.end_m)
+    cell = np.floor(point / spacing_m).astype(np.int64)
     _, first = np.unique(cell[:, 0] * 1_000_003 + cell[:, 1], return_index=True)
     kept = np.sort(first)
     if len(kept) > most:
         kept = kept[(np.arange(most) * len(kept) + len(kept) // 2) // most]
-    end = rays.end_m.astype(np.float32)
+    end = point.astype(np.float32)
     kept = kept[strip_order(end[kept])]
     return {
         "origin_m": rays.origin_m[kept].astype(np.float32),
