@@ -23,7 +23,7 @@ from soundmap.mapping.key_scans import STAGE, KeyScan, KeyScans, chosen_key_scan
 from soundmap.mapping.links import odometry_links
 from soundmap.mapping.loops import LoopSearch, close_loops
 from soundmap.mapping.occupancy import drawn_map
-from soundmap.mapping.pose_graph import Links, link_errors, solved_graph
+from soundmap.mapping.pose_graph import Links, solved_graph, told_errors
 from soundmap.mapping.relaxation import relaxed_poses
 from soundmap.odometry_model import OdometryModel, fitted_odometry
 from soundmap.sensors import LaserScan
@@ -61,7 +61,7 @@ class MapFacts:
     links : int
         Pairs of scans that hold each other in place.
     residual_m, residual_rad : float
-        Median disagreement of a pair of scans with the map [m, rad].
+        Median disagreement of a pair of scans with the map, where it tells its place [m, rad].
     body_returns : int
         Returns removed because they came from the robot itself.
     odometry : OdometryModel
@@ -258,17 +258,18 @@ def _facts(
     search: LoopSearch,
     model: OdometryModel,
 ) -> MapFacts:
-    error = link_errors(pose, _of_surfaces(links, len(pose)))
-    found = len(error) > 0
+    surfaces = _of_surfaces(links, len(pose))
+    off_m, off_rad = told_errors(pose, surfaces)
+    found = len(surfaces) > 0
     return MapFacts(
         key_scans=len(pose),
         unmatched=int(np.count_nonzero(~matched)),
         loops_searched=search.tried,
         loops_recognised=search.found,
         loops_closed=search.closed,
-        links=len(error),
-        residual_m=float(np.median(np.hypot(error[:, 0], error[:, 1]))) if found else 0.0,
-        residual_rad=float(np.median(np.abs(error[:, 2]))) if found else 0.0,
+        links=len(surfaces),
+        residual_m=float(np.median(off_m)) if found else 0.0,
+        residual_rad=float(np.median(off_rad)) if found else 0.0,
         body_returns=keys.body_returns,
         odometry=_fitted_model(keys.scans, pose, model),
     )

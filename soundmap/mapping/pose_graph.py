@@ -72,6 +72,19 @@ def link_costs(pose: FloatArray, links: Links) -> FloatArray:
     return np.einsum("mi,mij,mj->m", error, links.information, error)
 
 
+def told_errors(pose: FloatArray, links: Links) -> tuple[FloatArray, FloatArray]:
+    """How far poses lie from where links tell [m], and how far they are turned [rad], shapes (M,).
+
+    Across the direction in which a link tells most a metre counts as such, along others by the
+    square root of its share of the information: a corridor does not tell the place along it.
+    """
+    error = link_errors(pose, links)
+    place, place_information = error[:, :2], links.information[:, :2, :2]
+    most = np.maximum(np.linalg.eigvalsh(place_information)[:, -1], 1e-12)
+    square = np.einsum("mi,mij,mj->m", place, place_information, place)
+    return np.sqrt(np.maximum(square, 0.0) / most), np.abs(error[:, 2])
+
+
 @dataclass(frozen=True)
 class Solution:
     """Poses of a graph, and how they were reached.

@@ -3,7 +3,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from soundmap.geometry import relative, wrapped_angle
-from soundmap.mapping.pose_graph import Links, link_costs, link_errors, solved_graph
+from soundmap.mapping.pose_graph import Links, link_costs, link_errors, solved_graph, told_errors
 
 
 def made_graph(count=12, seed=5, noise=0.05):
@@ -66,3 +66,15 @@ def test_a_single_pose_stays():
 def test_links_need_a_measurement_each():
     with pytest.raises(ValueError, match="a pair"):
         Links(np.zeros((2, 2), dtype=np.int64), np.zeros((1, 3)), np.zeros((2, 3, 3)))
+
+
+def test_an_error_along_a_corridor_is_none_that_a_link_tells_of():
+    pose = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.1]])
+    links = Links(
+        np.array([[1, 0], [1, 0]]),
+        np.array([[0.8, 0.03, 0.1], [0.8, 0.03, 0.0]]),
+        np.array([np.diag([0.0, 9e4, 1e4]), np.diag([9e4, 9e4, 1e4])]),
+    )
+    off_m, off_rad = told_errors(pose, links)
+    np.testing.assert_allclose(off_m, [0.03, np.hypot(0.2, 0.03)])
+    np.testing.assert_allclose(off_rad, [0.0, 0.1], atol=1e-12)
