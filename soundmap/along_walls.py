@@ -10,18 +10,23 @@ HEARSAY = 0.003
 """Square of 3 degrees: how well directions of walls are known."""
 
 
-def without_hearsay(information: FloatArray, pull: FloatArray) -> tuple[FloatArray, FloatArray]:
+def without_hearsay(
+    information: FloatArray, pull: FloatArray, doubt: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
     """The evidence of laser scans less what errors of the walls' directions make up.
 
     Walls that all run one way say nothing about the place along them. Yet their directions are
-    known to about 3 degrees only, and the little that each seems to say of that place would add up
-    over a run to certainty. In the direction in which a scan tells least, `HEARSAY` of what it
-    tells across is taken off.
+    known to about 3 degrees at best, and the little that each seems to say of that place would add
+    up over a run to certainty. In the direction in which a scan tells least, `HEARSAY` of what it
+    tells across is taken off, and what is in doubt.
 
     Parameters
     ----------
     information : ndarray, shape (K, 3, 3)
     pull : ndarray, shape (K, 3)
+    doubt : ndarray, shape (K, 2, 2), optional
+        Information about the place that comes from scatter of the directions alone, where that has
+        been measured.
     """
     a, b, c = information[:, 0, 0], information[:, 0, 1], information[:, 1, 1]
     across = 0.5 * np.arctan2(2.0 * b, a - c)
@@ -31,7 +36,10 @@ def without_hearsay(information: FloatArray, pull: FloatArray) -> tuple[FloatArr
     by_heading = np.einsum("ki,ki->k", along, information[:, :, 2])
     known = np.einsum("ki,kij,kj->k", along, information, along)
     known = known - by_heading**2 / np.maximum(information[:, 2, 2], 1e-12)
-    taken = np.clip(known, 0.0, HEARSAY * most)
+    hearsay = HEARSAY * most
+    if doubt is not None:
+        hearsay += np.einsum("ki,kij,kj->k", along[:, :2], doubt, along[:, :2])
+    taken = np.clip(known, 0.0, np.maximum(hearsay, 0.0))
     share = taken / np.maximum(known, 1e-12)
     pulled = np.einsum("ki,ki->k", along, pull)
     return (

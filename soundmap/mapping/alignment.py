@@ -7,6 +7,11 @@ should lie on the surface line through the nearest return :math:`q` there, with 
 
 Both surfaces must face the same way, so that the two sides of a wall are not taken for one
 (iterative closest point: the paper's [8]; point to line: Censi, ICRA 2008).
+
+Normals err, and their scatter :math:`\sigma_n` seems to tell the place along a bare wall:
+:math:`\sum n n^T` holds :math:`\sigma_n^2` a return in that direction. The normals :math:`m` that
+the other scan gives the same surfaces err independently, so :math:`\sum (n m^T + m n^T) / 2` does
+not. What is lacking there is in doubt.
 """
 
 from __future__ import annotations
@@ -85,7 +90,7 @@ def pair_fits(
     gate_m: float,
     stride: int = 1,
 ) -> PairFits:
-    """Normal equations of each pair of scans at the given poses.
+    """Normal equations of each pair of scans at the given poses, without what is in doubt.
 
     Parameters
     ----------
@@ -100,11 +105,11 @@ def pair_fits(
         Only every so many-th return is matched, and counts so many times.
     """
     between = relative(pose[pairs[:, 1]], pose[pairs[:, 0]])
-    information, gradient, matched = _pair_equations(
+    information, gradient, doubt, matched = _pair_equations(
         store.end_m, store.normal, store.first, np.ascontiguousarray(between), pairs, gate_m, stride
     )
     scale = stride * CORRELATION / SIGMA_M**2
-    information, gradient = without_hearsay(scale * information, scale * gradient)
+    information, gradient = without_hearsay(scale * information, scale * gradient, scale * doubt)
     return PairFits(information, gradient, stride * matched)
 
 
@@ -257,9 +262,10 @@ def _pair_equations(
     pairs: NDArray[np.int64],
     gate: float,
     stride: int,
-) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
+) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.int64]]:
     information = np.zeros((len(pairs), 3, 3))
     gradient = np.zeros((len(pairs), 3))
+    doubt = np.zeros((len(pairs), 2, 2))
     matched = np.zeros(len(pairs), dtype=np.int64)
     for m in range(len(pairs)):
         i, j = pairs[m]
@@ -289,7 +295,11 @@ def _pair_equations(
                 gradient[m, a] += weight * row[a] * residual
                 for b in range(3):
                     information[m, a, b] += weight * row[a] * row[b]
-    return information, gradient, matched
+            for a in range(2):
+                for b in range(2):
+                    borne_out = 0.5 * (row[a] * facing[b] + facing[a] * row[b])
+                    doubt[m, a, b] += weight * (row[a] * row[b] - borne_out)
+    return information, gradient, doubt, matched
 
 
 @njit(cache=True, nogil=True)

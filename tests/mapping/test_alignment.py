@@ -13,6 +13,7 @@ from soundmap.mapping.alignment import (
     matched_share,
     pair_fits,
 )
+from soundmap.mapping.key_scans import KeyScan, strip_order
 from tests import worlds
 from tests.mapping import drives
 
@@ -27,11 +28,18 @@ def keys():
     return found, truth.at([key.time_ns for key in found])
 
 
+def handmade_key(end, normal):
+    end = end.astype(np.float32)
+    origin = np.zeros_like(end)
+    return KeyScan(0, 0, np.zeros(3), 0.0, 0.0, origin, end, normal.astype(np.float32))
+
+
 def slow_fit(moving, others, between, gate):
     """Normal equations by trying every return, straight from the formula."""
     x, y, turn = between
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     information, gradient, matched = np.zeros((3, 3)), np.zeros(3), 0
+    doubt = np.zeros((2, 2))
     for point, facing in zip(moving.end_m, moving.normal, strict=True):
         if not facing.any():
             continue
@@ -47,9 +55,13 @@ def slow_fit(moving, others, between, gate):
         weight = 1 / (1 + (residual / ROBUST_M) ** 2)
         information += weight * np.outer(row, row)
         gradient += weight * row * residual
+        both = np.outer(normal, rotation @ facing)
+        doubt += weight * (np.outer(normal, normal) - 0.5 * (both + both.T))
         matched += 1
     scale = CORRELATION / SIGMA_M**2
-    information, gradient = without_hearsay(information[None] * scale, gradient[None] * scale)
+    information, gradient = without_hearsay(
+        information[None] * scale, gradient[None] * scale, doubt[None] * scale
+    )
     return information[0], gradient[0], matched
 
 
@@ -126,3 +138,29 @@ def test_moving_everything_together_changes_nothing(keys):
     here = pair_fits(PointStore.of(scans), pose, pairs, gate_m=0.2)
     there = pair_fits(PointStore.of(scans), elsewhere, pairs, gate_m=0.2)
     np.testing.assert_allclose(here.information, there.information, rtol=1e-6)
+
+
+def test_scatter_of_normals_tells_nothing_along_a_bare_wall():
+    """Normals of the two scans err by 10 degrees, each by its own; a real second wall is kept."""
+    rng = np.random.default_rng(6)
+    along = np.linspace(-3, 3, 200)
+    wall = np.stack([along, np.ones(200)], axis=-1)
+    second = np.stack([np.full(40, 3.2), np.linspace(-1, 0.9, 40)], axis=-1)
+
+    def seen(parts):
+        end = np.concatenate([end for end, _ in parts])
+        facing = np.concatenate([np.full(len(end), angle) for end, angle in parts])
+        facing = facing + rng.normal(0, np.radians(10), len(end))
+        order = strip_order(end)
+        normal = np.stack([np.cos(facing), np.sin(facing)], axis=-1)
+        return handmade_key(end[order], normal[order])
+
+    parts = [(wall, -np.pi / 2), (wall * [1, -1], np.pi / 2)]
+    pairs = np.array([[1, 0]])
+    bare = PointStore.of([seen(parts), seen(parts)])
+    ended = PointStore.of([seen([*parts, (second, np.pi)]) for _ in range(2)])
+    pose = np.array([[0.0, 0.0, 0.0], [0.02, 0.0, 0.0]])
+    told = pair_fits(bare, pose, pairs, gate_m=0.15).information[0]
+    assert told[1, 1] > 1e4
+    assert told[0, 0] < 0.004 * told[1, 1]
+    assert pair_fits(ended, pose, pairs, gate_m=0.15).information[0, 0, 0] > 2e3
