@@ -24,6 +24,9 @@ REACH_M = 0.15
 LEAST_POINTS = 6
 FLATNESS = 0.2
 """Greatest ratio of the variances across and along a line that still is one."""
+SURE_RAD = np.radians(3.0)
+"""How well a straight wall of the map tells its direction; what is no such wall needs returns that
+tell as well."""
 
 
 @dataclass(frozen=True)
@@ -62,16 +65,28 @@ def wall_lines(surface: Surface, points_m: Iterable[FloatArray]) -> WallLines:
             np.ascontiguousarray(part),
             REACH_M,
         )
+    return _fitted_lines(surface, moments)
+
+
+def _fitted_lines(surface: Surface, moments: FloatArray) -> WallLines:
+    """The line through each cell's returns; where they are few, turned towards the map's wall."""
     count, x, y, xx, xy, yy = _with_neighbours(surface.own, surface.cell, moments).T
     total = np.maximum(count, 1.0)
     mean = np.stack([x, y], axis=-1) / total[:, None]
     var_x, var_y = xx / total - mean[:, 0] ** 2, yy / total - mean[:, 1] ** 2
     cov = xy / total - mean[:, 0] * mean[:, 1]
     half_sum, half_gap = 0.5 * (var_x + var_y), np.hypot(0.5 * (var_x - var_y), cov)
-    along = 0.5 * np.arctan2(2.0 * cov, var_x - var_y)
-    flat = half_sum - half_gap <= FLATNESS * (half_sum + half_gap)
-    exists = (count >= LEAST_POINTS) & flat & (half_sum + half_gap > 1e-6)
-    normal = np.stack([-np.sin(along), np.cos(along)], axis=-1) * exists[:, None]
+    along, across = half_sum + half_gap, np.maximum(half_sum - half_gap, 0.0)
+    exists = (count >= LEAST_POINTS) & (across <= FLATNESS * along) & (along > 1e-6)
+    tilt = 0.5 * np.arctan2(2.0 * cov, var_x - var_y)
+    # The direction of a line errs by the scatter across it, that of the map's wall by SURE_RAD.
+    doubt = across / np.maximum(along * (count - 2.0), 1e-12)
+    wall = np.arctan2(-surface.normal[:, 0], surface.normal[:, 1])
+    is_wall = np.any(surface.normal != 0.0, axis=1)
+    turn = (wall - tilt + 0.5 * np.pi) % np.pi - 0.5 * np.pi
+    tilt = tilt + np.where(is_wall, doubt / (doubt + SURE_RAD**2), 0.0) * turn
+    exists &= is_wall | (doubt <= SURE_RAD**2)
+    normal = np.stack([-np.sin(tilt), np.cos(tilt)], axis=-1) * exists[:, None]
     # Moments are taken about each cell's own lower-left corner of the map.
     return WallLines(normal, np.sum(normal * (mean + surface.corner_m), axis=1))
 

@@ -125,6 +125,25 @@ def test_scattered_returns_and_few_returns_are_no_line():
     assert not has_line(surface, wall_lines(surface, [few]), few).any()
 
 
+@pytest.mark.parametrize(("returns", "most_deg"), [(2000, 2.0), (150, 3.0)])
+def test_lines_of_few_noisy_returns_follow_the_wall_of_the_map(returns, most_deg):
+    """Nine returns to a line, with 1.5 cm of noise, tell its direction to 7 degrees only."""
+    frame = GridFrame(0.05, (0.0, 0.0), (40, 60))
+    occupied = np.zeros(frame.shape, dtype=bool)
+    occupied[20] = True
+    surface = map_surface(OccupancyGrid(frame, occupied, ~occupied))
+    rng = np.random.default_rng(5)
+    points = np.column_stack(
+        [rng.uniform(0.2, 2.8, returns), 1.02 + rng.normal(0.0, 0.015, returns)]
+    )
+    lines = wall_lines(surface, [points])
+    exists = np.any(lines.normal != 0, axis=1)
+    assert exists.mean() > 0.3
+    tilt = np.degrees(np.arctan2(lines.normal[exists, 0], lines.normal[exists, 1]))
+    tilt = (tilt + 90.0) % 180.0 - 90.0
+    assert np.sqrt(np.mean(tilt**2)) < most_deg
+
+
 def test_points_far_from_every_wall_do_not_pull():
     far = np.array([[0.0, 1.0], [0.5, 1.0]])  # in the middle of the room, seen from (1, 1)
     pose = np.array([[1.0, 1.0, 0.0]])
