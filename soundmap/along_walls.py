@@ -8,6 +8,8 @@ from soundmap.geometry import FloatArray
 
 HEARSAY = 0.003
 """Square of 3 degrees: how well directions of walls are known."""
+NEIGHBOURS = 2
+"""Scans on either side that have to see what tells the place."""
 
 
 def without_hearsay(
@@ -46,3 +48,34 @@ def without_hearsay(
         information - taken[:, None, None] * along[:, :, None] * along[:, None, :],
         pull - (share * pulled)[:, None] * along,
     )
+
+
+def unsupported(information: FloatArray) -> FloatArray:
+    """What scans tell of the place that those just before and after them do not tell.
+
+    A wall that ends the way is seen by one scan after another; one or two returns of a single scan
+    that happen to lie on the corner of a map are no such wall.
+
+    Parameters
+    ----------
+    information : ndarray, shape (K, 3, 3)
+        Of scans by time.
+
+    Returns
+    -------
+    ndarray, shape (K, 2, 2)
+        Information about the place beyond that of the `NEIGHBOURS` on either side together; zero
+        if there is one scan only.
+    """
+    count = len(information)
+    if count < 2:
+        return np.zeros((count, 2, 2))
+    turn = information[:, :2, 2]
+    by_turn = turn[:, :, None] * turn[:, None, :]
+    place = information[:, :2, :2] - by_turn / np.maximum(information[:, 2:, 2:], 1e-12)
+    around = np.zeros_like(place)
+    for away in range(1, min(NEIGHBOURS, count - 1) + 1):
+        around[away:] += place[:-away]
+        around[:-away] += place[away:]
+    share, axes = np.linalg.eigh(place - around)
+    return (axes * np.maximum(share, 0.0)[:, None, :]) @ axes.swapaxes(1, 2)

@@ -162,6 +162,8 @@ def _smoothed(
         way_m = np.concatenate([[0.0], np.cumsum(np.hypot(step[:, 0], step[:, 1]))])
         trusted = _trusted(agreed, result, trusted, way_m, config)
         trusted = without_scraps(trusted, pose, step, way_m)
+        if not trusted.any():
+            break
         if round_ == 0:  # later poses follow the odometry and cannot judge it
             both = trusted[:-1] & trusted[1:]
             found = relative(pose[:-1], pose[1:])
@@ -279,7 +281,7 @@ def _joined(known: Trajectory, odometry: Trajectory) -> Trajectory:
 def _why_lost(estimate: Estimate, room: OccupancyGrid) -> str:
     matched, beyond = float(np.median(estimate.matched)), float(np.median(estimate.beyond))
     if matched >= FIRST_MATCH and beyond <= MOST_BEYOND:
-        return CANNOT_TELL
+        return CANNOT_TELL if estimate.covariance is None else _why_unknown(estimate.covariance)
     left, right, bottom, top = room.frame.extent_m
     return (
         f"the laser scans do not match the map, which spans x {left:.1f} to {right:.1f} m and "
@@ -287,4 +289,13 @@ def _why_lost(estimate: Estimate, room: OccupancyGrid) -> str:
         f"returns lie on its walls (expected {FIRST_MATCH:.0%} or more) and {beyond:.0%} behind "
         f"them (expected {MOST_BEYOND:.0%} or less). Is it the map of this site, are the scanners' "
         "mounts right, and is --start-pose (if given) that of the first scan?"
+    )
+
+
+def _why_unknown(covariance: FloatArray) -> str:
+    spread_m = float(np.sqrt(np.trace(covariance[:, :2, :2], axis1=1, axis2=2)).min())
+    return (
+        "the laser scans match the map, but nothing in their reach tells where along its walls the "
+        f"robot is: its place is known to {spread_m:.1f} m at best. Does the run pass a corner, a "
+        "door or the end of the corridor?"
     )

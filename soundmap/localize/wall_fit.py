@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from soundmap.along_walls import without_hearsay
+from soundmap.along_walls import unsupported, without_hearsay
 from soundmap.config import LocalizeConfig
 from soundmap.geometry import FloatArray, transformed
 from soundmap.grid import OccupancyGrid
@@ -62,7 +62,7 @@ class WallFit:
             return weight * information, weight * pull
 
         if not by_lines:
-            return lambda at: without_hearsay(*by_map(at))
+            return lambda at: _borne_out(*by_map(at))
         lines = wall_lines(self._surface, (part for _, part in _placed(pose, points_m, first)))
         for own, part in _placed(pose, points_m, first):
             share[own][has_line(self._surface, lines, part)] = MAP_SHARE
@@ -72,9 +72,14 @@ class WallFit:
                 self._surface, lines, at, points_m, first, sigma_m=sigma_m, kernel_m=KERNEL_M
             )
             map_information, map_pull = by_map(at)
-            return without_hearsay(weight * information + map_information, weight * pull + map_pull)
+            return _borne_out(weight * information + map_information, weight * pull + map_pull)
 
         return by_both
+
+
+def _borne_out(information: FloatArray, pull: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Evidence of views less what errors of walls' directions and single returns make up."""
+    return without_hearsay(information, pull, unsupported(information))
 
 
 def _placed(
