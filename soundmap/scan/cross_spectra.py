@@ -133,10 +133,14 @@ def _as_lanes(samples, lanes):  # type: ignore[no-untyped-def]
     part = np.empty(LANES, dtype=np.float32)
     for lane in range(0, width, LANES):
         for first in range(0, length, _ROWS_A_SUM):
-            summed = constant(0.0)
-            for t in range(first, min(first + _ROWS_A_SUM, length)):
+            last = min(first + _ROWS_A_SUM, length) - 1
+            summed, next_summed = constant(0.0), constant(0.0)
+            for t in range(first, last, 2):  # no sum waits for the other
                 summed = summed + load(lanes, t * width + lane)
-            store(part, 0, summed)
+                next_summed = next_summed + load(lanes, (t + 1) * width + lane)
+            if (last - first) % 2 == 0:
+                summed = summed + load(lanes, last * width + lane)
+            store(part, 0, summed + next_summed)
             for i in range(LANES):
                 total[lane + i] += part[i]
     return (total / length).astype(np.float32)

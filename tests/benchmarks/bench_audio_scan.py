@@ -3,8 +3,9 @@
     python tests/benchmarks/bench_audio_scan.py [--seconds 30] [--repeats 5]
 
 30 s of 16 channels, 48 kHz, 16 bit, with two sources in noise; one thread. CPU seconds, best and
-worst of the repeats: steadier than the wall clock on a busy machine. The program's form is timed
-from blocks of samples to audio scans, as the pipeline runs it; the others get their samples whole.
+worst of the repeats, in which the forms take turns: steadier than the wall clock on a busy machine.
+The program's form is timed from blocks of samples to audio scans, as the pipeline runs it; the
+others get their samples whole.
 
 pyroomacoustics' SRP gets the frames' spectra made by itself (its phase transform is always on).
 Acoular's BeamformerBase is timed twice: from samples, with its own cross-spectra, as its manual
@@ -12,8 +13,15 @@ shows, and alone, on cross-spectra that are there already. Its frames have a pow
 and overlap by half, so they are about the same sound, not the same frames. Neither is a part of
 the project: `pip install acoular` to have it measured. Slow forms are timed on a part.
 
+The yardstick is the best that was had from ready-made parts: scipy's real transforms of bare frames
+in single precision, the window as three taps on the bins, cross-spectra of baselines by a loop that
+numba compiles, and a product of matrices for half of the bearings. It tells the band as a whole,
+where the program tells four parts of it apart.
+
 The last row is a limit: the arithmetic of the program's form at the speed of a large product of
-single-precision matrices.
+single-precision matrices. Below the table stand the figures that the program is held to; what is in
+brackets is the ratio of the worst to the best time and of the best to the worst. Two threads are
+timed by the wall clock, which means something on an idle machine.
 """
 
 from __future__ import annotations
@@ -31,10 +39,12 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.fft
 from machine import machine
+from numba import njit
 
 from soundmap.config import ArrayConfig, ScanConfig
 from soundmap.geometry import Mount
@@ -55,6 +65,21 @@ RATE_HZ = 48000.0
 CONFIG = ScanConfig()
 POSITIONS = ArrayConfig().microphone_positions()
 FRAMING = Framing.from_times(RATE_HZ, window_s=0.025, hop_s=0.010, frames=10)
+BAND = band_bins(RATE_HZ, FRAMING.window, low_hz=CONFIG.low_hz, high_hz=CONFIG.high_hz)
+TABLE = steering_table(
+    POSITIONS,
+    CONFIG.bearings,
+    first_bin=BAND.first,
+    frequency_hz=BAND.frequency_hz,
+    weight=BAND.weight,
+    speed_of_sound_m_s=CONFIG.speed_of_sound_m_s,
+)
+HALF = CONFIG.bearings // 2
+COSINE, SINE = (
+    np.ascontiguousarray(table[..., :HALF].transpose(2, 1, 0)).reshape(HALF, -1)
+    for table in (TABLE.cosine, TABLE.sine)
+)
+OWN = "soundmap, blocks of 20 ms"
 SOURCES = ((47.0, 1.0), (200.0, 0.7))
 """Bearing [deg] and strength."""
 
@@ -74,7 +99,7 @@ def recording(seconds: float) -> np.ndarray:
     return np.rint(2000.0 * samples).astype(np.int16)
 
 
-def fast(samples: np.ndarray, block: int) -> np.ndarray:
+def fast(samples: np.ndarray, block: int, threads: int = 1) -> np.ndarray:
     """The package's form, from blocks of so many samples."""
     array = MicArray(POSITIONS, Mount.planar(0.0, 0.0, 0.0, 0.0), None)
 
@@ -83,16 +108,16 @@ def fast(samples: np.ndarray, block: int) -> np.ndarray:
             time_ns = round(start * 1e9 / RATE_HZ)
             yield AudioBlock(time_ns, RATE_HZ, samples[start : start + block], 32768.0, start > 0)
 
-    return np.array([scan.power for scan in audio_scans(blocks(), array, CONFIG)])
+    scans = audio_scans(blocks(), array, CONFIG, threads=threads)
+    return np.array([scan.power for scan in scans])
 
 
 def per_frame(samples: np.ndarray) -> np.ndarray:
     """Plain numpy in double precision: each frame windowed, transformed, steered by an einsum."""
-    band = band_bins(RATE_HZ, FRAMING.window, low_hz=CONFIG.low_hz, high_hz=CONFIG.high_hz)
     steering = np.stack(
         [
             steering_vectors(POSITIONS, scan_bearings(CONFIG.bearings), f, speed_of_sound_m_s=343.0)
-            for f in band.frequency_hz
+            for f in BAND.frequency_hz
         ]
     ).conj()
     window = np.hanning(FRAMING.window + 1)[:-1, None]
@@ -102,9 +127,9 @@ def per_frame(samples: np.ndarray) -> np.ndarray:
         for frame in range(FRAMING.frames):
             start = scan * FRAMING.advance + frame * FRAMING.hop
             excerpt = samples[start : start + FRAMING.window] / 32768.0
-            spectrum = np.fft.rfft(window * excerpt, axis=0)[band.first : band.first + len(band)]
+            spectrum = np.fft.rfft(window * excerpt, axis=0)[BAND.first : BAND.first + len(BAND)]
             focused = np.einsum("knq,kq->kn", steering, spectrum) / len(POSITIONS)
-            power[scan] += band.weight @ np.abs(focused) ** 2
+            power[scan] += BAND.weight @ np.abs(focused) ** 2
     return power / (FRAMING.frames * hann_power(FRAMING.window))
 
 
@@ -128,6 +153,51 @@ def direct(samples: np.ndarray) -> np.ndarray:
     )
 
 
+@njit(cache=True, nogil=True)
+def apart(samples, channels):  # type: ignore[no-untyped-def]
+    """Interleaved samples (T, Q) as channels (Q, T), a few at a time."""
+    length, count = samples.shape
+    for first in range(0, length, 64):
+        for q in range(count):
+            for t in range(first, min(first + 64, length)):
+                channels[q, t] = np.float32(samples[t, q])
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def products(re, im, first, second, baseline, sums):  # type: ignore[no-untyped-def]
+    """Sums (2, B, K) over pairs and frames of spectra (Q, F, K)."""
+    sums[:] = 0.0
+    for i in range(len(first)):
+        m, n, line = first[i], second[i], baseline[i]
+        for f in range(re.shape[1]):
+            for k in range(re.shape[2]):
+                sums[0, line, k] += re[m, f, k] * re[n, f, k] + im[m, f, k] * im[n, f, k]
+                sums[1, line, k] += im[m, f, k] * re[n, f, k] - re[m, f, k] * im[n, f, k]
+
+
+def yardstick(samples: np.ndarray) -> np.ndarray:
+    """The form of ready-made parts, in batches of 32 scans."""
+    lines, batch = TABLE.baselines, 32
+    scans = (len(samples) - FRAMING.span) // FRAMING.advance + 1
+    power = np.empty((scans, CONFIG.bearings), dtype=np.float32)
+    channels = np.empty((len(POSITIONS), FRAMING.span), dtype=np.float32)
+    frames = np.lib.stride_tricks.sliding_window_view(channels, FRAMING.window, axis=1)
+    frames = frames[:, :: FRAMING.hop]
+    sums = np.empty((batch, 2, len(lines), len(BAND)), dtype=np.float32)
+    for start in range(0, scans, batch):
+        count = min(batch, scans - start)
+        for i in range(count):
+            apart(samples[(start + i) * FRAMING.advance :][: FRAMING.span], channels)
+            bare = scipy.fft.rfft(frames)[..., BAND.first - 1 : BAND.first + len(BAND) + 1]
+            windowed = 0.5 * bare[..., 1:-1] - 0.25 * (bare[..., :-2] + bare[..., 2:])
+            re, im = np.ascontiguousarray(windowed.real), np.ascontiguousarray(windowed.imag)
+            products(re, im, lines.first, lines.second, lines.baseline, sums[i])
+        even = sums[:count, 0].reshape(count, -1) @ COSINE.T
+        odd = sums[:count, 1].reshape(count, -1) @ SINE.T
+        power[start : start + count] = np.concatenate([even + odd, even - odd], axis=1)
+    return power / (FRAMING.frames * hann_power(FRAMING.window) * len(POSITIONS) ** 2 * 32768.0**2)
+
+
 def transforms_alone(samples: np.ndarray) -> np.ndarray:
     """Nothing but the real transforms of all frames, single precision, channel by channel."""
     channels = np.ascontiguousarray(samples.T).astype(np.float32)
@@ -148,8 +218,7 @@ def pyroomacoustics_srp(samples: np.ndarray) -> np.ndarray:
     import pyroomacoustics as pra
 
     bearing = scan_bearings(CONFIG.bearings)
-    band = band_bins(RATE_HZ, FRAMING.window, low_hz=CONFIG.low_hz, high_hz=CONFIG.high_hz)
-    bins = np.arange(band.first, band.first + len(band))
+    bins = np.arange(BAND.first, BAND.first + len(BAND))
     srp = pra.doa.SRP(POSITIONS.T[:2], RATE_HZ, FRAMING.window, c=343.0, azimuth=bearing)
     window = np.hanning(FRAMING.window + 1)[:-1]
     power = []
@@ -196,9 +265,8 @@ def acoular_alone(matrices: list[np.ndarray]) -> np.ndarray:
     """Acoular's BeamformerBase on cross-spectral matrices that are there."""
     import acoular
 
-    band = band_bins(RATE_HZ, FRAMING.window, low_hz=CONFIG.low_hz, high_hz=CONFIG.high_hz)
     spectra = acoular.PowerSpectraImport()
-    spectra.frequencies = band.frequency_hz
+    spectra.frequencies = BAND.frequency_hz
     beamformer = acoular.BeamformerBase(freq_data=spectra, steer=_acoular_steering(), cached=False)
     power = []
     for matrix in matrices:
@@ -209,10 +277,9 @@ def acoular_alone(matrices: list[np.ndarray]) -> np.ndarray:
 
 def matrices_of(samples: np.ndarray) -> list[np.ndarray]:
     """Cross-spectral matrices of all scans, double precision."""
-    band = band_bins(RATE_HZ, FRAMING.window, low_hz=CONFIG.low_hz, high_hz=CONFIG.high_hz)
     return [
         np.ascontiguousarray(
-            cross_spectral_matrix(band_spectrum(excerpt.T / 32768.0, FRAMING, band))
+            cross_spectral_matrix(band_spectrum(excerpt.T / 32768.0, FRAMING, BAND))
         )
         for excerpt in excerpts(samples)
     ]
@@ -220,39 +287,107 @@ def matrices_of(samples: np.ndarray) -> list[np.ndarray]:
 
 def limit_s(scans: int) -> float:
     """CPU time of the form's arithmetic at the speed of a large matrix product."""
-    band = band_bins(RATE_HZ, FRAMING.window, low_hz=CONFIG.low_hz, high_hz=CONFIG.high_hz)
-    table = steering_table(
-        POSITIONS,
-        CONFIG.bearings,
-        first_bin=band.first,
-        frequency_hz=band.frequency_hz,
-        weight=band.weight,
-        speed_of_sound_m_s=343.0,
-    )
     q, length, frames = len(POSITIONS), FRAMING.window, FRAMING.frames
     transforms = 2.5 * length * np.log2(length) * q * frames
-    window = 10.0 * len(band) * q * frames
-    products = 8.0 * len(band) * len(table.baselines.first) * frames
-    steering = 4.0 * table.groups[0].cosine.size
+    window = 10.0 * len(BAND) * q * frames
+    products = 8.0 * len(BAND) * len(TABLE.baselines.first) * frames
+    steering = 2.0 * (COSINE.size + SINE.size)
     a, b = np.ones((2, 1024, 1024), dtype=np.float32)
-    speed = 2.0 * 1024**3 / cpu_seconds(lambda: a @ b, 5)[0]
+    speed = 2.0 * 1024**3 / min(seconds_of(lambda: a @ b)[0] for _ in range(5))
     return float(scans * (transforms + window + products + steering) / speed)
 
 
-def cpu_seconds(action: Callable[[], np.ndarray], repeats: int) -> tuple[float, float, np.ndarray]:
-    """CPU time of the best and the worst of several calls, and what they returned."""
-    times, result = [], np.empty(0)
-    for _ in range(repeats):
-        start = time.process_time()
-        result = action()
-        times.append(time.process_time() - start)
-    return min(times), max(times), result
+def seconds_of(action: Callable[[], np.ndarray]) -> tuple[float, float, np.ndarray]:
+    """CPU and wall time of a call, and what it returned."""
+    cpu, wall = time.process_time(), time.perf_counter()
+    result = action()
+    return time.process_time() - cpu, time.perf_counter() - wall, result
 
 
 def loudest_deg(power: np.ndarray) -> float:
     """Bearing of the highest peak of the mean over all scans."""
     scan = AudioScan(0, scan_bearings(CONFIG.bearings), power.mean(axis=0))
     return float(np.degrees(scan.peaks()[0][0]))
+
+
+@dataclass
+class Form:
+    """A form, the audio it is timed on, and its times for each second of audio."""
+
+    name: str
+    audio: np.ndarray
+    action: Callable[[], np.ndarray]
+    repeats: int
+    cpu_s: list[float] = field(default_factory=list)
+    wall_s: list[float] = field(default_factory=list)
+    power: np.ndarray = field(default_factory=lambda: np.empty(0))
+
+    def run(self) -> None:
+        """Take the time once more."""
+        cpu, wall, self.power = seconds_of(self.action)
+        seconds = len(self.audio) / RATE_HZ
+        self.cpu_s.append(cpu / seconds)
+        self.wall_s.append(wall / seconds)
+
+    def row(self, own: Form) -> str:
+        """Its line of the table."""
+        best = min(self.cpu_s)
+        spread = f" to {max(self.cpu_s):.5f}" if len(self.cpu_s) > 1 else ""
+        found, off = "-", "-"
+        if len(self.power):
+            found = f"{loudest_deg(self.power):.2f}"
+            if not self.name.startswith(("pyroom", "Acoular")):  # those have other units
+                difference = np.abs(self.power - own.power[: len(self.power)]).max()
+                off = f"{difference / own.power.max():.1e}"
+        ratio = best / min(own.cpu_s)
+        return (
+            f"| {self.name} | {best:.5f}{spread} | {1 / best:.1f} | {ratio:.2f} | {found} | {off} |"
+        )
+
+
+def forms(samples: np.ndarray, repeats: int) -> list[Form]:
+    """All forms, the program's first."""
+    part = samples[: round(3.0 * RATE_HZ)]
+    second = samples[: round(RATE_HZ)]
+    few = min(repeats, 3)
+    result = [
+        Form(OWN, samples, lambda: fast(samples, 960), repeats),
+        Form("soundmap, blocks of 1 s", samples, lambda: fast(samples, 48000), repeats),
+        Form("soundmap, two threads", samples, lambda: fast(samples, 960, threads=2), repeats),
+        Form("yardstick of ready-made parts", samples, lambda: yardstick(samples), repeats),
+        Form("scipy's transforms alone", samples, lambda: transforms_alone(samples), repeats),
+        Form("plain numpy, einsum a frame", samples, lambda: per_frame(samples), 1),
+        Form("direct reference", second, lambda: direct(second), 1),
+        Form("pyroomacoustics SRP", part, lambda: pyroomacoustics_srp(part), few),
+    ]
+    if importlib.util.find_spec("acoular"):
+        matrices = matrices_of(part)
+        acoular_alone(matrices[:2])  # compiles
+        result += [
+            Form("Acoular from samples", part, lambda: acoular_from_samples(part), few),
+            Form("Acoular BeamformerBase alone", part, lambda: acoular_alone(matrices), few),
+        ]
+    return result
+
+
+def verdict(measured: dict[str, Form], limit: float) -> list[str]:
+    """What the program is held to, and what it reaches."""
+    own = measured[OWN].cpu_s
+
+    def against(name: str) -> str:
+        other = measured[name].cpu_s
+        low, high = min(other) / max(own), max(other) / min(own)
+        return f"{min(other) / min(own):.1f} x ({low:.1f} to {high:.1f}) as fast as {name}"
+
+    threads, one = measured["soundmap, two threads"].wall_s, measured[OWN].wall_s
+    return [
+        *(f"{against(name)}; held to 50" for name in measured if name.startswith("pyroom")),
+        *(f"{against(name)}; held to 50" for name in measured if name.startswith("Acoular")),
+        f"{against('yardstick of ready-made parts')}; held to 1 / 1.5",
+        f"{min(own) / limit:.1f} x ({max(own) / limit:.1f}) the time of its arithmetic alone",
+        f"two threads, wall clock: {1 / min(threads):.0f} x real time, "
+        f"{min(one) / min(threads):.2f} x as fast as one",
+    ]
 
 
 def main() -> None:
@@ -262,48 +397,26 @@ def main() -> None:
     options = parser.parse_args()
     samples = recording(options.seconds)
     fast(samples[: round(4 * RATE_HZ)], 960)  # compiles
-    part = samples[: round(min(3.0, options.seconds) * RATE_HZ)]
-    second = samples[: round(RATE_HZ)]
-    once, few = 1, min(options.repeats, 3)
-    forms = [
-        ("soundmap, blocks of 20 ms", samples, lambda: fast(samples, 960), options.repeats),
-        ("soundmap, blocks of 1 s", samples, lambda: fast(samples, 48000), options.repeats),
-        ("scipy's transforms alone", samples, lambda: transforms_alone(samples), options.repeats),
-        ("plain numpy, einsum a frame", samples, lambda: per_frame(samples), once),
-        ("direct reference", second, lambda: direct(second), once),
-        ("pyroomacoustics SRP", part, lambda: pyroomacoustics_srp(part), few),
-    ]
-    if importlib.util.find_spec("acoular"):
-        matrices = matrices_of(part)
-        acoular_alone(matrices[:2])  # compiles
-        forms += [
-            ("Acoular from samples", part, lambda: acoular_from_samples(part), few),
-            ("Acoular BeamformerBase alone", part, lambda: acoular_alone(matrices), few),
-        ]
+    yardstick(samples[: round(RATE_HZ)])
+    measured = forms(samples, options.repeats)
+    for turn in range(options.repeats):
+        for form in measured:
+            if turn < form.repeats:
+                form.run()
     packages = ("numpy", "scipy", "numba", "pyroomacoustics", "acoular")
     print(f"{machine(*packages)}; one thread")
     print(f"{options.seconds:g} s, {len(POSITIONS)} channels, {RATE_HZ:g} Hz, int16\n")
     print("| form | CPU s per s of audio | x real time | ratio | loudest [deg] | difference |")
     print("|---|---|---|---|---|---|")
-    baseline, truth, own_deg = 0.0, np.empty(0), 0.0
-    for name, audio, action, repeats in forms:
-        best, worst, power = cpu_seconds(action, repeats)
-        seconds = len(audio) / RATE_HZ
-        if not baseline:
-            baseline, truth, own_deg = best / seconds, power, loudest_deg(power)
-        spread = f" to {worst / seconds:.5f}" if repeats > 1 else ""
-        found, off = ("-", "-")
-        if len(power):
-            found = f"{loudest_deg(power):.2f}"
-            if not name.startswith(("pyroom", "Acoular")):  # those have other units
-                off = f"{np.abs(power - truth[: len(power)]).max() / truth.max():.1e}"
-        print(f"| {name} | {best / seconds:.5f}{spread} | {seconds / best:.1f} ", end="")
-        print(f"| {best / seconds / baseline:.2f} | {found} | {off} |", flush=True)
-    limit = limit_s(len(truth)) / options.seconds
-    print(
-        f"| limit by arithmetic | {limit:.5f} | {1 / limit:.0f} | {limit / baseline:.2f} | - | - |"
-    )
-    sys.exit(0 if abs(own_deg - SOURCES[0][0]) < 0.3 else 1)
+    own = measured[0]
+    for form in measured:
+        print(form.row(own))
+    limit = limit_s(len(own.power)) / options.seconds
+    share = limit / min(own.cpu_s)
+    print(f"| limit by arithmetic | {limit:.5f} | {1 / limit:.0f} | {share:.2f} | - | - |\n")
+    for line in verdict({form.name: form for form in measured}, limit):
+        print(f"- {line}")
+    sys.exit(0 if abs(loudest_deg(own.power) - SOURCES[0][0]) < 0.3 else 1)
 
 
 if __name__ == "__main__":
