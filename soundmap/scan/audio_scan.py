@@ -1,13 +1,11 @@
 r"""Audio scans: how loud each bearing is, ten times a second (Sect. 2.3, Eqs. 1-2).
 
-The room's last module: it cuts the stream of audio into scans, says when each was taken, and has
-them transformed, correlated and steered, a batch at a time, by several threads if wanted. Only a
-few batches of samples are ever kept.
+The room's last module: it has the stream of audio cut into scans, transformed, correlated and
+steered, a batch at a time, by several threads if wanted. Only a few batches are ever kept.
 """
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -23,6 +21,7 @@ from soundmap.geometry import FloatArray, Mount
 from soundmap.losses import LossLedger
 from soundmap.scan.cross_spectra import BaselineSpectra
 from soundmap.scan.response import steered_response_power, whitening
+from soundmap.scan.sample_stream import SampleStream
 from soundmap.scan.spectrum import Framing, band_bins, hann_power
 from soundmap.scan.steering import SteeringTable, steering_table
 from soundmap.sensors import AudioBlock, MicArray
@@ -79,7 +78,7 @@ def audio_scans(
         If a block has not one channel a microphone, or the band does not fit its sample rate.
     """
     with _Workers(threads) as workers:
-        stream: _Stream | None = None
+        stream: SampleStream | None = None
         scanner: _Scanner | None = None
         for block in blocks:
             if block.samples.shape[1] != array.microphones:
@@ -88,17 +87,19 @@ def audio_scans(
                     f"the array has {array.microphones} microphones"
                 )
             if stream is None or scanner is None or not stream.is_continued_by(block):
-                yield from _scans(workers, stream, scanner, losses, last=True)
+                if stream is not None and scanner is not None:
+                    workers.submit(scanner, *stream.rest())
                 if scanner is None or not scanner.suits(block):
                     scanner = _Scanner.of(array, config, block, sharp=sharp)
-                stream = _Stream(block.rate_hz, block.full_scale, scanner.framing)
-            stream.append(block)
+                stream = SampleStream(block, scanner.framing, scanner.batch, scanner.spare)
+            for batch in stream.batches(block):
+                workers.submit(scanner, *batch)
+                del batch
+                yield from _finite(workers.results(wait=False), losses)
             del block  # a long one need not outlive its scans while the next is being read
-            yield from _scans(workers, stream, scanner, losses, last=False)
-            stream.keep_only_what_is_needed()
-        yield from _scans(workers, stream, scanner, losses, last=True)
-        while (batch := workers.next_result(wait=True)) is not None:
-            yield from _finite(batch, losses)
+        if stream is not None and scanner is not None:
+            workers.submit(scanner, *stream.rest())
+        yield from _finite(workers.results(wait=True), losses)
 
 
 def kept_scans(
@@ -139,25 +140,8 @@ def kept_scans(
     )
 
 
-def _scans(
-    workers: _Workers,
-    stream: _Stream | None,
-    scanner: _Scanner | None,
-    losses: LossLedger | None,
-    *,
-    last: bool,
-) -> Iterator[AudioScan]:
-    """Sets the workers to the batches whose samples are all there; the scans done meanwhile."""
-    if stream is None or scanner is None:
-        return
-    while (excerpt := stream.next_excerpt(scanner.batch, last=last)) is not None:
-        workers.submit(scanner, *excerpt)
-        while (batch := workers.next_result(wait=False)) is not None:
-            yield from _finite(batch, losses)
-
-
-def _finite(batch: list[AudioScan], losses: LossLedger | None) -> Iterator[AudioScan]:
-    for scan in batch:
+def _finite(scans: Iterable[AudioScan], losses: LossLedger | None) -> Iterator[AudioScan]:
+    for scan in scans:
         if np.all(np.isfinite(scan.power)):
             yield scan
         elif losses is not None:
@@ -188,16 +172,15 @@ class _Workers:
         done.set_result(scanner.scans(time_ns, samples))
         self._waiting.append(done)
 
-    def next_result(self, *, wait: bool) -> list[AudioScan] | None:
-        """The next batch if it is done, waited for if more are waiting than there are threads.
+    def results(self, *, wait: bool) -> Iterator[AudioScan]:
+        """Scans of the batches that are done, and of any that more than one a thread wait behind.
 
-        None if there is no batch or, unless ``wait``, none done.
+        Of all batches if ``wait``.
         """
-        if not self._waiting:
-            return None
-        if wait or len(self._waiting) > self._threads or self._waiting[0].done():
-            return self._waiting.popleft().result()
-        return None
+        while self._waiting and (
+            wait or len(self._waiting) > self._threads or self._waiting[0].done()
+        ):
+            yield from self._waiting.popleft().result()
 
 
 def _square_of_unit(array: MicArray, full_scale: float) -> float:
@@ -227,6 +210,8 @@ class _Scanner:
     sharp: bool
     batch: int
     """Scans in a batch."""
+    spare: list[NDArray[Any]]
+    """Memory of batches that are done."""
     _own: local
 
     @classmethod
@@ -248,7 +233,16 @@ class _Scanner:
         square = _square_of_unit(array, full_scale)
         batch = int(np.clip(BATCH_BYTES // (4 * np.prod(table.spectra_shape)), 4, BATCH))
         return cls(
-            rate_hz, full_scale, square, framing, table, array.microphones, sharp, batch, local()
+            rate_hz,
+            full_scale,
+            square,
+            framing,
+            table,
+            array.microphones,
+            sharp,
+            batch,
+            [],
+            local(),
         )
 
     def suits(self, block: AudioBlock) -> bool:
@@ -256,11 +250,12 @@ class _Scanner:
         return block.rate_hz == self.rate_hz and block.full_scale == self.full_scale
 
     def scans(self, time_ns: list[int], samples: NDArray[Any]) -> list[AudioScan]:
-        """A batch of scans at these times from the samples (T, Q) of all.
+        """A batch of scans at these times from the samples (T, Q) of all, whose memory it takes.
 
         The powers of a scan are not finite if any of its samples is not.
         """
         spectra, finite = self._spectra(samples, len(time_ns))
+        self.spare.append(samples)
         with np.errstate(invalid="ignore", over="ignore"):
             weight = whitening(spectra, self.table) if self.sharp else None
             raw, white = steered_response_power(spectra, self.table, weight)
@@ -298,86 +293,3 @@ class _Scanner:
                 finite[i] = own.maker.add(excerpt, spectra[i])
         spectra[~finite] = 0.0
         return spectra, finite
-
-
-@dataclass(frozen=True)
-class _Piece:
-    """Consecutive samples of one block; ``first`` and ``origin`` count since the last gap."""
-
-    first: int
-    samples: NDArray[Any]
-    origin: int
-    """First sample of the block, which was taken at ``time_ns``."""
-    time_ns: int
-
-    @property
-    def end(self) -> int:
-        return self.first + len(self.samples)
-
-    def copy(self, start: int) -> _Piece:
-        """What is left from ``start`` on, in memory of its own."""
-        done = max(start - self.first, 0)
-        return _Piece(self.first + done, self.samples[done:].copy(), self.origin, self.time_ns)
-
-
-class _Stream:
-    """The samples since the last gap that are still needed, and when they were taken."""
-
-    def __init__(self, rate_hz: float, full_scale: float, framing: Framing) -> None:
-        self._rate_hz = rate_hz
-        self._full_scale = full_scale
-        self._framing = framing
-        self._pieces: deque[_Piece] = deque()
-        self._end = 0
-        self._next = 0
-
-    def is_continued_by(self, block: AudioBlock) -> bool:
-        """Whether scans may run on into a block."""
-        same = block.rate_hz == self._rate_hz and block.full_scale == self._full_scale
-        return block.continues and same
-
-    def append(self, block: AudioBlock) -> None:
-        """Take in the samples that follow."""
-        if len(block.samples):
-            self._pieces.append(_Piece(self._end, block.samples, self._end, block.time_ns))
-            self._end += len(block.samples)
-
-    def next_excerpt(self, most: int, *, last: bool) -> tuple[list[int], NDArray[Any]] | None:
-        """Middles [ns] of the next scans and their samples (T, Q), in memory of their own.
-
-        So many scans as wanted, or None until their samples are there; the rest if it is the last.
-        """
-        framing = self._framing
-        whole = (self._end - self._next - framing.span) // framing.advance + 1
-        scans = min(whole, most)
-        if scans < (1 if last else most):
-            return None
-        start, stop = self._next, self._next + (scans - 1) * framing.advance + framing.span
-        samples = [
-            piece.samples[max(start - piece.first, 0) : stop - piece.first]
-            for piece in self._pieces
-            if piece.first < stop and piece.end > start
-        ]
-        half = (framing.span - 1) / 2.0
-        times = self._times_ns([start + i * framing.advance + half for i in range(scans)])
-        self._next += scans * framing.advance
-        return times, np.concatenate(samples)
-
-    def _times_ns(self, samples: list[float]) -> list[int]:
-        """Times of samples, or of points between two, by the clock of the block that holds each."""
-        firsts = [piece.first for piece in self._pieces]
-        times = []
-        for sample in samples:
-            piece = self._pieces[bisect_right(firsts, sample) - 1]
-            times.append(piece.time_ns + round((sample - piece.origin) * 1e9 / self._rate_hz))
-        return times
-
-    def keep_only_what_is_needed(self) -> None:
-        """Let go of what scans are done with: never more than the samples of a batch are kept.
-
-        To be called after every block, the newest piece being the caller's memory until then.
-        """
-        if self._pieces:
-            self._pieces.append(self._pieces.pop().copy(self._next))
-        while self._pieces and self._pieces[0].end <= self._next:
-            self._pieces.popleft()

@@ -466,3 +466,18 @@ def test_the_sub_bands_add_up_to_the_band_and_tell_its_parts_apart():
     np.testing.assert_allclose(scan.sub_bands.sum(axis=0), scan.power, rtol=1e-5)
     assert scan.sub_bands.max(axis=1).argmax() == 3
     assert scan.sub_bands[:3].max() < 1e-4 * scan.sub_bands[3].max()
+
+
+def test_the_type_of_samples_may_change_within_a_stream():
+    samples = np.random.default_rng(17).standard_normal((200000, 3)).astype(np.float32)
+    array = mic_array(circle(3))
+    whole = list(audio_scans(blocks_of(samples, RATE), array, PAPER))
+    mixed = [
+        AudioBlock(block.time_ns, RATE, block.samples.astype(kind), 1.0, block.continues)
+        for block, kind in zip(
+            blocks_of(samples, RATE, [90000]), ("float32", "float64"), strict=True
+        )
+    ]
+    scans = list(audio_scans(mixed, array, PAPER))
+    assert len(scans) == 41
+    assert all(np.array_equal(a.power, b.power) for a, b in zip(scans, whole, strict=True))
