@@ -34,10 +34,13 @@ def without_hearsay(
     across = 0.5 * np.arctan2(2.0 * b, a - c)
     most = 0.5 * (a + c) + np.hypot(0.5 * (a - c), b)
     along = np.stack([-np.sin(across), np.cos(across), np.zeros(len(a))], axis=-1)
-    # What is known along the walls whatever the heading is.
-    by_heading = np.einsum("ki,ki->k", along, information[:, :, 2])
+    # What is known along the walls whatever the heading and the place across them are.
+    facing = np.stack([np.cos(across), np.sin(across), np.zeros(len(a))], axis=-1)
+    along_by_heading = np.einsum("ki,ki->k", along, information[:, :, 2])
+    across_by_heading = np.einsum("ki,ki->k", facing, information[:, :, 2])
+    heading = information[:, 2, 2] - across_by_heading**2 / np.maximum(most, 1e-12)
     known = np.einsum("ki,kij,kj->k", along, information, along)
-    known = known - by_heading**2 / np.maximum(information[:, 2, 2], 1e-12)
+    known = known - along_by_heading**2 / np.maximum(heading, 1e-12)
     hearsay = HEARSAY * most
     if doubt is not None:
         hearsay += np.einsum("ki,kij,kj->k", along[:, :2], doubt, along[:, :2])

@@ -45,3 +45,12 @@ def test_what_is_known_of_the_place_by_the_heading_alone_counts_at_no_scan():
     assert unsupported(np.stack([told, np.diag([3000.0, 0.0, 1.0])])) == pytest.approx(
         0.0, abs=1e-6
     )
+
+
+def test_evidence_never_becomes_negative_whatever_is_in_doubt():
+    rng = np.random.default_rng(7)
+    root = rng.normal(size=(500, 3, 3)) * [1.0, 1.0, 3.0]
+    information = root @ root.swapaxes(1, 2)
+    doubt = np.tile(1e6 * np.eye(2), (500, 1, 1))
+    told, _ = without_hearsay(information, np.zeros((500, 3)), doubt)
+    assert np.linalg.eigvalsh(told).min() > -1e-6
