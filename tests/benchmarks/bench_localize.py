@@ -11,7 +11,9 @@ second set of lines has the start pose.
 With a log and a reference trajectory in its map, the log is localized in the map and, as a strict
 test, in a map built from its first 60 %: the whole of it, and its last 40 %. Such a map differs
 from the reference itself, as a line says; localization alone shows in a map of the same scans that
-is drawn with the reference's poses. Times are CPU seconds.
+is drawn with the reference's poses. Errors are told with and without their constant part: a map may
+be drawn up to half a cell beside the walls, and poses are in the frame of the map as drawn. Times
+are CPU seconds.
 """
 
 from __future__ import annotations
@@ -79,6 +81,8 @@ def outcome(drive: Drive, *, told: bool = False) -> str:
     off = found.pose - drive.truth.at(found.time_ns)
     known = found.usable & np.isfinite(off[:, 0])
     error_m, turn = np.hypot(off[known, 0], off[known, 1]), np.abs(wrapped_angle(off[known, 2]))
+    shift = np.median(off[known, :2], axis=0)
+    about_m = np.hypot(*(off[known, :2] - shift).T)
     speed = (found.time_ns[-1] - found.time_ns[0]) * 1e-9 / took_s
     verdict = "right" if error_m.max() < RIGHT_M else "WRONG"
     return (
@@ -155,15 +159,19 @@ def robustness(scene: str, starts: int, *, told: bool) -> None:
 
 
 def judged(found: Trajectory, truth: Trajectory) -> str:
-    """Errors of the usable poses, and the share of them."""
+    """Errors of the usable poses, what is left less their constant part, and the usable share."""
     found = found.of_scans()
     off = found.pose - truth.at(found.time_ns)
     known = found.usable & np.isfinite(off[:, 0])
     error_m, turn = np.hypot(off[known, 0], off[known, 1]), np.abs(wrapped_angle(off[known, 2]))
+    shift = np.median(off[known, :2], axis=0)
+    about_m = np.hypot(*(off[known, :2] - shift).T)
     return (
         f"median {np.median(error_m):.3f}, 95 % {np.quantile(error_m, 0.95):.3f}, mean "
         f"{error_m.mean():.3f}, greatest {error_m.max():.2f} m, heading "
-        f"{np.degrees(turn.mean()):.2f} deg, {found.usable.mean():.0%} usable"
+        f"{np.degrees(turn.mean()):.2f} deg, {found.usable.mean():.0%} usable; about a constant "
+        f"({shift[0]:+.3f}, {shift[1]:+.3f}) m: median {np.median(about_m):.3f}, 95 % "
+        f"{np.quantile(about_m, 0.95):.3f} m"
     )
 
 
