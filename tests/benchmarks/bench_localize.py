@@ -81,8 +81,6 @@ def outcome(drive: Drive, *, told: bool = False) -> str:
     off = found.pose - drive.truth.at(found.time_ns)
     known = found.usable & np.isfinite(off[:, 0])
     error_m, turn = np.hypot(off[known, 0], off[known, 1]), np.abs(wrapped_angle(off[known, 2]))
-    shift = np.median(off[known, :2], axis=0)
-    about_m = np.hypot(*(off[known, :2] - shift).T)
     speed = (found.time_ns[-1] - found.time_ns[0]) * 1e-9 / took_s
     verdict = "right" if error_m.max() < RIGHT_M else "WRONG"
     return (
