@@ -10,6 +10,8 @@ from pathlib import Path
 from time import perf_counter
 
 import numba
+import numpy as np
+from numpy.typing import NDArray
 
 from soundmap.calibrate.calibration import array_offsets
 from soundmap.config import Config, ScanConfig
@@ -37,8 +39,9 @@ from soundmap.outputs.progress import Progress, Stage
 from soundmap.run import Run
 from soundmap.scan.audio_scan import audio_scans, kept_scans
 from soundmap.scan.spectrum import band_bins
-from soundmap.sensors import ArrayOffsets, AudioBlock, LaserScan, MicArray
+from soundmap.sensors import ArrayOffsets, AudioBlock, LaserScan
 from soundmap.sound import AudioScans, PowerMap, SourceList
+from soundmap.surroundings import NO_SURROUNDINGS
 
 MOST_THREADS = 4
 """Threads that turn sound into audio scans; they keep up with any reading of the log."""
@@ -82,31 +85,19 @@ def process(
     given = None if map_path is None else read_map(map_path)
     clock = _Stopwatch(progress)
     measured, from_cache = _kept_or_measured(log_path, given, config, start_pose, cache, clock)
-    room, trajectory = measured.room, measured.trajectory
-    losses = LossLedger()
+    room, trajectory, losses = measured.room, measured.trajectory, LossLedger()
     with clock.stage("calibrate"):
-        scans, array, offsets = _calibrated(measured.scans, measured.array, trajectory, config)
+        measured, offsets = _calibrated(measured, config)
+    scans, array = measured.scans, measured.array
     if heard is not None:
         heard(scans, trajectory)
     with clock.stage("fuse"):
-        frame = power_map_frame(room, config.fuse.cell_m)
-        accumulator = PowerAccumulator(frame, level_reference(array.pascal_per_count))
-        fused = sum(
-            scan.point_m is not None
-            for scan in fused_scans(
-                scans,
-                measured.surroundings,
-                trajectory,
-                accumulator,
-                array.mount,
-                config.fuse,
-                losses=losses,
-            )
-        )
-        power_map = accumulator.power_map()
+        power_map, fused = _fused(measured, config, losses)
+        around = ranges_around(measured.surroundings, trajectory, scans.time_ns, array.mount)
+        measured = replace(measured, surroundings=NO_SURROUNDINGS)
     with clock.stage("detect"):
         if config.detect.method == "sparse":
-            sources, power_map = _fitted(measured, scans, array, frame, config, losses)
+            sources, power_map = _fitted(measured, around, power_map.frame, config, losses)
         else:
             sources = detect_sources(power_map, config.detect)
     return Run(
@@ -133,23 +124,54 @@ def process(
     )
 
 
+def _calibrated(measured: Measured, config: Config) -> tuple[Measured, ArrayOffsets | None]:
+    """The same with clock and yaw corrected where they are clearly off, and by how much."""
+    scans, array = measured.scans, measured.array
+    if scans.sharp is None:
+        return measured, None
+    found = array_offsets(
+        scans.sharp, scans.time_ns, measured.trajectory, array, config.scan, config.calibrate
+    )
+    mount = array.mount.turned(found.yaw.correction)
+    time_ns = scans.time_ns + round(found.clock.correction * 1e9)
+    scans = replace(scans, time_ns=time_ns, mount=mount, sharp=None)
+    return replace(measured, scans=scans, array=replace(array, mount=mount)), found
+
+
+def _fused(measured: Measured, config: Config, losses: LossLedger) -> tuple[PowerMap, int]:
+    """The power map by Eqs. (3)-(5), and how many audio scans are in it."""
+    array = measured.array
+    frame = power_map_frame(measured.room, config.fuse.cell_m)
+    accumulator = PowerAccumulator(frame, level_reference(array.pascal_per_count))
+    fused = fused_scans(
+        measured.scans,
+        measured.surroundings,
+        measured.trajectory,
+        accumulator,
+        array.mount,
+        config.fuse,
+        losses=losses,
+    )
+    count = sum(scan.point_m is not None for scan in fused)
+    return accumulator.power_map(), count
+
+
 def _fitted(
     measured: Measured,
-    scans: AudioScans,
-    array: MicArray,
+    around: NDArray[np.float32],
     frame: GridFrame,
     config: Config,
     losses: LossLedger,
 ) -> tuple[SourceList, PowerMap]:
     """Sources of the fit to all scans, and the power map that goes with them."""
     room, trajectory = measured.room, measured.trajectory
+    scans, array = measured.scans, measured.array
     if trajectory.extent_m() < LEAST_EXTENT_M:
         losses.remark(
             "robot hardly moves",
             "detect",
             effect="from one place bearings do not cross: hardly a source can be told",
         )
-    around = ranges_around(measured.surroundings, trajectory, scans.time_ns, array.mount)
     sources = fitted_sources(
         scans, around, trajectory, array, config.scan, config.detect, room=room
     )
@@ -259,21 +281,6 @@ def _measured_of(
         fingerprint=log.fingerprint,
         duration_s=log.duration_s,
     )
-
-
-def _calibrated(
-    scans: AudioScans, array: MicArray, trajectory: Trajectory, config: Config
-) -> tuple[AudioScans, MicArray, ArrayOffsets | None]:
-    """Scans and array with clock and yaw corrected where they are clearly off, and by how much."""
-    if scans.sharp is None:
-        return scans, array, None
-    found = array_offsets(
-        scans.sharp, scans.time_ns, trajectory, array, config.scan, config.calibrate
-    )
-    mount = array.mount.turned(found.yaw.correction)
-    time_ns = scans.time_ns + round(found.clock.correction * 1e9)
-    scans = replace(scans, time_ns=time_ns, mount=mount, sharp=None)
-    return scans, replace(array, mount=mount), found
 
 
 def _built_map(log: RobotLog, config: Config, clock: _Stopwatch) -> BuiltMap:

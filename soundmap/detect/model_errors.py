@@ -59,10 +59,14 @@ class Precision:
     def __init__(self, evidence: Evidence, components: Sequence[Sounding]) -> None:
         starts = evidence.table.starts
         self.starts = starts
-        self.inverse = [
-            np.empty((len(evidence), stop - start, stop - start), dtype=np.float32)
-            for start, stop in pairwise(starts)
-        ]
+        sizes = [stop - start for start, stop in pairwise(starts)]
+        if not components:
+            self.inverse = [
+                np.broadcast_to(np.eye(size, dtype=np.float32), (len(evidence), size, size))
+                for size in sizes
+            ]
+            return
+        self.inverse = [np.empty((len(evidence), size, size), dtype=np.float32) for size in sizes]
 
         def invert(scans: slice) -> None:
             modes = [mode for each in components for mode in _modes(evidence, each, scans)]

@@ -62,7 +62,7 @@ def surface_ranges(
         motion = relative(trajectory.at(time_ns[row]), then)
         fixed = np.isfinite(motion).all(axis=-1)
         row, motion = row[fixed], motion[fixed]
-        points = surroundings.point_m[place[row]].astype(np.float32)
+        points = surroundings.points(place[row]).astype(np.float32)
         _surface_ranges(points, motion, centre, axes, bearing, tolerance_rad, row, ranges)
 
     side_by_side(fill, range(0, len(time_ns), CHUNK))

@@ -11,7 +11,7 @@ from numba import njit
 from soundmap.deskew import deskewed_rays
 from soundmap.geometry import FloatArray, Trajectory
 from soundmap.sensors import LaserScan
-from soundmap.surroundings import Surroundings
+from soundmap.surroundings import Surroundings, SurroundingsPacker
 
 DIRECTIONS = 720
 """Directions from the base in which a point is kept."""
@@ -35,15 +35,14 @@ class SurroundingsGatherer:
         self._near: deque[LaserScan] = deque()
         self._due: deque[int] = deque()
         self._last: LaserScan | None = None
-        self._time_ns: list[int] = []
-        self._point_m = bytearray()  # of half-precision numbers; it grows in place
+        self._packer = SurroundingsPacker(DIRECTIONS)
 
     def see(self, scan: LaserScan) -> None:
         """Look at one more scan; scans come by time."""
         time_ns = scan.middle_ns
         self._near.append(scan)
         self._last = scan
-        latest = self._due[-1] if self._due else self._time_ns[-1] if self._time_ns else None
+        latest = self._due[-1] if self._due else self._packer.last_ns
         if latest is None or time_ns - latest >= INTERVAL_NS:
             self._due.append(time_ns)
         while self._due and self._due[0] < time_ns - LASER_AGE_NS:
@@ -53,10 +52,10 @@ class SurroundingsGatherer:
         """The surroundings of all scans seen; to be called once, after the last."""
         while self._due:
             self._take(self._due.popleft())
-        if self._last is not None and self._last.middle_ns > self._time_ns[-1]:
+        latest = self._packer.last_ns
+        if self._last is not None and latest is not None and self._last.middle_ns > latest:
             self._take(self._last.middle_ns)
-        points = np.frombuffer(self._point_m, dtype=np.float16).reshape(-1, DIRECTIONS, 2)
-        return Surroundings(np.array(self._time_ns, dtype=np.int64), points)
+        return self._packer.surroundings()
 
     def _take(self, time_ns: int) -> None:
         """Keep what is seen at a time in the scan of each scanner that is nearest to it."""
@@ -73,8 +72,7 @@ class SurroundingsGatherer:
             deskewed_rays(nearest[scanner][1], self._odometry, time_ns).end_m
             for scanner in sorted(nearest)
         ]
-        self._time_ns.append(time_ns)
-        self._point_m += thinned(np.concatenate(points), DIRECTIONS).astype(np.float16).data
+        self._packer.add(time_ns, thinned(np.concatenate(points), DIRECTIONS))
 
 
 def gathered_surroundings(lasers: Iterable[LaserScan], odometry: Trajectory) -> Surroundings:

@@ -157,6 +157,7 @@ def _smoothed(
         counts = agreed.is_matched & np.repeat(trusted, np.diff(views.first))
         scans = walls.evidence(views, counts, pose, by_lines=round_ > 0)
         result = smoothed_poses(step, weight, pose, scans)
+        del scans  # holds a copy of all returns that count
         pose = result.pose
         agreed = agreement(room, pose, views, tolerance_m=tolerance_m)
         way_m = np.concatenate([[0.0], np.cumsum(np.hypot(step[:, 0], step[:, 1]))])

@@ -8,8 +8,10 @@ whole scan, and later only shows that the pose still holds.
 from __future__ import annotations
 
 import math
+from array import array
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,17 +91,6 @@ class Views:
 
 
 @dataclass(frozen=True)
-class _View:
-    """One of the views to be kept, with its rays in single precision."""
-
-    time_ns: int
-    scanner: int
-    is_evidence: bool
-    origin_m: NDArray[np.float32]
-    end_m: NDArray[np.float32]
-
-
-@dataclass(frozen=True)
 class _Place:
     """Where a scanner last looked from, how often, when last, and what it saw then."""
 
@@ -129,7 +120,7 @@ class ViewChooser:
         self._places: dict[int, _Place] = {}
         self._passed_over: dict[int, LaserScan] = {}
         self._range_max_m = 0.0
-        self._chosen: list[_View] = []
+        self._chosen = _ChosenViews()
 
     def see(self, scan: LaserScan) -> None:
         """Look at one more scan; scans come by time.
@@ -154,8 +145,8 @@ class ViewChooser:
                 return
             stands = way < 1.0 and not (way < AT_REST and self._looks_elsewhere(place, scan))
             looks = place.looks if stands else 0
-        view = self._view(scan, time_ns, is_evidence=looks < self._most_looks)
-        if len(view.end_m) < LEAST_RAYS:
+        rays = self._rays(scan)
+        if len(rays) < LEAST_RAYS:
             self._losses.add("laser scan with too few returns", STAGE, effect="scan not used")
             return
         self._passed_over.pop(scan.scanner, None)
@@ -165,7 +156,7 @@ class ViewChooser:
             self._places[scan.scanner] = _Place(x, y, heading, 1, time_ns, compared_ranges(scan))
         self._witness.see(scan)
         self._range_max_m = max(self._range_max_m, scan.range_max_m)
-        self._chosen.append(view)
+        self._chosen.add(scan.scanner, rays, is_evidence=looks < self._most_looks)
 
     def views(self) -> Views:
         """What was chosen; among it the first and the last scan of every scanner.
@@ -177,30 +168,16 @@ class ViewChooser:
         NothingUsableError
             No scan has enough returns within the time of the odometry.
         """
-        if not self._chosen:
+        chosen = self._chosen
+        if not len(chosen.time_ns):
             raise NothingUsableError(
                 "no laser scan has enough returns at a time that the odometry spans; the robot "
                 "cannot be localized. `soundmap info` shows what the log holds."
             )
-        last = [
-            self._view(scan, scan.middle_ns, is_evidence=False)
-            for scan in self._passed_over.values()
-        ]
-        chosen = sorted([*self._chosen, *last], key=lambda view: view.time_ns)
-        self._chosen.clear()
-        time_ns = np.array([view.time_ns for view in chosen], dtype=np.int64)
-        driven_m = self._odometry.driven_m()
-        return Views(
-            time_ns=time_ns,
-            odometry=self._odometry.at(time_ns),
-            driven_m=np.interp(time_ns, self._odometry.time_ns, driven_m),
-            is_evidence=np.array([view.is_evidence for view in chosen]),
-            scanner=np.array([view.scanner for view in chosen], dtype=np.int64),
-            range_max_m=self._range_max_m,
-            first=np.cumsum([0, *(len(view.end_m) for view in chosen)], dtype=np.int64),
-            origin_m=np.concatenate([view.origin_m for view in chosen]),
-            end_m=np.concatenate([view.end_m for view in chosen]),
-        )
+        for scan in self._passed_over.values():
+            chosen.add(scan.scanner, self._rays(scan), is_evidence=False)
+        self._chosen = _ChosenViews()
+        return chosen.views(self._odometry, self._range_max_m)
 
     def _way(self, place: _Place, x_m: float, y_m: float, heading_rad: float) -> float:
         """Motion since the scanner's last place, 1 where it makes a new one."""
@@ -224,15 +201,63 @@ class ViewChooser:
         """Whether the robot has moved unnoticed by its odometry."""
         return has_moved(place.ranges, compared_ranges(scan))
 
-    def _view(self, scan: LaserScan, time_ns: int, *, is_evidence: bool) -> _View:
-        rays = deskewed_rays(scan, self._odometry, time_ns, most=self._config.beams)
-        return _View(
-            time_ns,
-            scan.scanner,
-            is_evidence,
-            rays.origin_m.astype(np.float32),
-            rays.end_m.astype(np.float32),
+    def _rays(self, scan: LaserScan) -> Rays:
+        return deskewed_rays(scan, self._odometry, scan.middle_ns, most=self._config.beams)
+
+
+class _ChosenViews:
+    """Views to be kept, nearly in order; their rays, in single precision, grow in place."""
+
+    def __init__(self) -> None:
+        self.time_ns = array("q")
+        self._scanner, self._is_evidence, self._count = array("q"), array("b"), array("q")
+        self._origin_m, self._end_m = bytearray(), bytearray()
+
+    def add(self, scanner: int, rays: Rays, *, is_evidence: bool) -> None:
+        self.time_ns.append(rays.time_ns)
+        self._scanner.append(scanner)
+        self._is_evidence.append(is_evidence)
+        self._count.append(len(rays))
+        self._origin_m += rays.origin_m.astype(np.float32).data
+        self._end_m += rays.end_m.astype(np.float32).data
+
+    def views(self, odometry: Trajectory, range_max_m: float) -> Views:
+        """All of them by time, without a second copy of the rays."""
+        added_ns = np.array(self.time_ns, dtype=np.int64)
+        order = np.argsort(added_ns, kind="stable")
+        time_ns, count = added_ns[order], np.array(self._count, dtype=np.int64)
+        first = np.concatenate([[0], np.cumsum(count[order])])
+        origin_m, end_m = (
+            np.frombuffer(rays, dtype=np.float32).reshape(-1, 2)
+            for rays in (self._origin_m, self._end_m)
         )
+        _reorder(origin_m, count, order)
+        _reorder(end_m, count, order)
+        return Views(
+            time_ns=time_ns,
+            odometry=odometry.at(time_ns),
+            driven_m=np.interp(time_ns, odometry.time_ns, odometry.driven_m()),
+            is_evidence=np.array(self._is_evidence, dtype=bool)[order],
+            scanner=np.array(self._scanner, dtype=np.int64)[order],
+            range_max_m=range_max_m,
+            first=first,
+            origin_m=origin_m,
+            end_m=end_m,
+        )
+
+
+def _reorder(rays: NDArray[np.float32], count: NDArray[np.int64], order: NDArray[np.int64]) -> None:
+    """Bring the rays of all views, so many of each, into another order, in place.
+
+    Only neighbours and the last few views are out of order: they are moved group by group.
+    """
+    place = np.arange(len(order))
+    begins = np.flatnonzero(np.maximum.accumulate(order) == place) + 1
+    start = np.concatenate([[0], np.cumsum(count)])
+    for low, high in pairwise([0, *begins.tolist()]):
+        if high - low > 1:
+            moved = [rays[start[view] : start[view + 1]] for view in order[low:high].tolist()]
+            rays[start[low] : start[high]] = np.concatenate(moved)
 
 
 def chosen_views(

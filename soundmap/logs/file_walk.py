@@ -28,7 +28,7 @@ from soundmap.logs.file_summary import (
     FileSummary,
     file_summary,
 )
-from soundmap.logs.records import Batch, Channel, KnownChunk, Message, Wanted
+from soundmap.logs.records import Batch, Channel, Message, Wanted
 from soundmap.logs.resync import is_near, next_record
 
 if TYPE_CHECKING:
@@ -241,14 +241,14 @@ class FileWalk:
             data = self.ahead.content(stream, offset, length)
         except RECORD_DAMAGE as error:
             self.log.count("damaged chunk", self.file.name, f"left out ({_reason(error)})")
-            self.log.known_chunks[place] = KnownChunk(frozenset(), 0, 0)
+            self.log.remember_chunk(place, (), 0, 0)
             return None
         messages, times_ns, seen = self._chunk_messages(memoryview(data))
         if not times_ns or not seen:
-            self.log.known_chunks[place] = KnownChunk(frozenset(), 0, 0)
+            self.log.remember_chunk(place, (), 0, 0)
             return None
         batch = _batch(messages, times_ns)
-        self.log.known_chunks[place] = KnownChunk(frozenset(seen), batch.first_ns, batch.last_ns)
+        self.log.remember_chunk(place, seen, batch.first_ns, batch.last_ns)
         return batch
 
     def _chunk_messages(self, data: memoryview) -> tuple[list[Message], list[int], set[Channel]]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import struct
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -53,6 +53,7 @@ class McapLog:
         self._changed_ns = tuple(state.st_mtime_ns for state in states)
         self.known_chunks: dict[tuple[int, int], KnownChunk] = {}
         self.known_channels: dict[int, dict[int, Channel]] = {}
+        self._channel_sets: dict[frozenset[Channel], frozenset[Channel]] = {}
         self._surveyed = False
 
     @property
@@ -109,6 +110,14 @@ class McapLog:
                     f"{file}: has been changed or removed while it was read. Try again once nobody "
                     "writes to it."
                 )
+
+    def remember_chunk(
+        self, place: tuple[int, int], channels: Iterable[Channel], first_ns: int, last_ns: int
+    ) -> None:
+        """Keep what a chunk holds; chunks with the same channels share the set of them."""
+        own = frozenset(channels)
+        shared = self._channel_sets.setdefault(own, own)
+        self.known_chunks[place] = KnownChunk(shared, first_ns, last_ns)
 
     def count(self, what: str, where: str, effect: str, *, count: int = 1) -> None:
         """Count damage, unless an earlier pass has."""

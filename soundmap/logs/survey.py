@@ -201,11 +201,11 @@ class Survey:
         self.losses = log.losses
         self.start_ns = self.end_ns = self.messages = 0
         self._need_audio, self._keep_times = need_audio, keep_times
-        self._takers: dict[Channel, Callable[[Message], None]] = {}
+        takers: dict[Channel, Callable[[Message], None]] = {}
         for message in log.messages():
-            taker = self._takers.get(message.channel)
+            taker = takers.get(message.channel)
             if taker is None:
-                taker = self._takers[message.channel] = self._taker(message.channel)
+                taker = takers[message.channel] = self._taker(message.channel)
             taker(message)
             self.messages += 1
         self._remark_on_built_in_types()

@@ -3,7 +3,7 @@ import pytest
 
 from soundmap.fuse.bearing_range import ranges_around, ranges_on_bearings, surface_ranges
 from soundmap.geometry import Mount, Trajectory, relative, transformed
-from soundmap.surroundings import Surroundings
+from soundmap.surroundings import NO_SURROUNDINGS, SurroundingsPacker
 
 MOUNTS = {
     "turned": Mount.planar(0.1, -0.05, 0.6, 0.7),
@@ -49,7 +49,10 @@ def driving(rng):
     track = Trajectory(time_ns, np.cumsum(step, axis=0), np.ones(200, dtype=bool))
     points = rng.normal(0.0, 3.0, (40, 90, 2)).astype(np.float16)
     points[rng.random((40, 90)) < 0.2] = np.nan
-    return track, Surroundings(time_ns[::5], points)
+    packer = SurroundingsPacker(90)
+    for time, own in zip(time_ns[::5].tolist(), points, strict=True):
+        packer.add(time, own)
+    return track, packer.surroundings()
 
 
 @pytest.mark.parametrize("mount", MOUNTS.values(), ids=MOUNTS)
@@ -67,7 +70,7 @@ def test_the_compiled_ranges_are_the_plain_ones(mount, bearings):
     measured = 0
     for time, wanted, ranges in zip(time_ns, bearing, found, strict=True):
         nearest = int(np.argmin(np.abs(surroundings.time_ns - time)))
-        points = surroundings.point_m[nearest].astype(float)
+        points = surroundings.points(np.array([nearest]))[0].astype(float)
         points = points[np.isfinite(points[:, 0])]
         motion = relative(track.at(time), track.at(surroundings.time_ns[nearest]))
         seen = transformed(motion, points) - mount.translation_m[:2]
@@ -85,5 +88,4 @@ def test_ranges_are_unknown_where_no_surroundings_or_motion_are():
     time_ns = track.time_ns[-1] + np.array([-(10**8), 1, 10**9])
     ranges = ranges_around(surroundings, track, time_ns, MOUNTS["turned"])
     assert np.isfinite(ranges).any(axis=1).tolist() == [True, False, False]
-    nothing = Surroundings(np.empty(0, np.int64), np.empty((0, 90, 2), np.float16))
-    assert np.isnan(ranges_around(nothing, track, time_ns, MOUNTS["turned"])).all()
+    assert np.isnan(ranges_around(NO_SURROUNDINGS, track, time_ns, MOUNTS["turned"])).all()
