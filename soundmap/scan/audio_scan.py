@@ -285,11 +285,6 @@ class _Scanner:
             own.maker = BaselineSpectra(self.microphones, self.framing, self.table)
             own.spectra = np.empty((self.batch, *self.table.spectra_shape), dtype=np.float32)
         spectra = own.spectra[:scans]
-        finite = np.zeros(scans, dtype=bool)
         with np.errstate(invalid="ignore", over="ignore"):
-            for i in range(scans):
-                start = i * self.framing.advance
-                excerpt = samples[start : start + self.framing.span]
-                finite[i] = own.maker.add(excerpt, spectra[i])
-        spectra[~finite] = 0.0
+            finite = own.maker.write(samples, self.framing.advance, spectra)
         return spectra, finite

@@ -34,7 +34,7 @@ _ROWS_A_SUM = 64
 
 
 class BaselineSpectra:
-    """Turns samples into cross-spectra; keeps the memory that this takes for the next scan.
+    """Turns samples into cross-spectra; keeps the memory that this takes for the next scans.
 
     Parameters
     ----------
@@ -56,29 +56,41 @@ class BaselineSpectra:
         self._sums = lanes_array(2, baselines, LANES)
         self._pairs = _pairs_by_baseline(table, self._parts[0, 0].size)
 
-    def add(self, samples: NDArray[Any], spectra: NDArray[np.float32]) -> bool:
-        """Writes the cross-spectra of one scan.
+    def write(
+        self, samples: NDArray[Any], advance: int, spectra: NDArray[np.float32]
+    ) -> NDArray[np.bool_]:
+        """Writes the cross-spectra of consecutive scans.
 
         Parameters
         ----------
-        samples : ndarray, shape (span, Q)
-            In whatever type they were recorded.
-        spectra : ndarray of float32, shape (2, K, B)
-            Where real and imaginary parts go, as `SteeringTable.spectra_shape` says; unchanged if
-            the samples are not finite.
+        samples : ndarray, shape (T, Q)
+            Of all scans, in whatever type they were recorded.
+        advance : int
+            Samples from the start of one scan to that of the next.
+        spectra : ndarray of float32, shape (S, 2, K, B)
+            Where real and imaginary parts go, as `SteeringTable.spectra_shape` says; nought for a
+            scan whose samples are not all finite.
 
         Returns
         -------
-        bool
-            Whether all samples are finite.
+        ndarray of bool, shape (S,)
+            Whether the samples of each scan are all finite.
         """
-        mean = _as_lanes(np.ascontiguousarray(samples), self._samples)
-        if not np.all(np.isfinite(mean)):
-            return False
-        hop = self._framing.hop
-        _write_parts(self._samples, hop, mean, self._plan, self._spectrum, self._parts)
-        _write_sums(self._parts, *self._pairs, self._sums, spectra)
-        return True
+        finite = np.empty(len(spectra), dtype=bool)
+        _write_scans(
+            np.ascontiguousarray(samples),
+            advance,
+            self._framing.hop,
+            self._plan,
+            self._samples,
+            self._spectrum,
+            self._parts,
+            *self._pairs,
+            self._sums,
+            spectra,
+            finite,
+        )
+        return finite
 
 
 def _pairs_by_baseline(
@@ -114,6 +126,33 @@ def baseline_spectra_plain(
     summed = np.zeros((len(band), len(lines)), dtype=matrix.dtype)
     np.add.at(summed.T, lines.baseline, matrix[:, lines.first, lines.second].T)
     return np.stack([summed.real, summed.imag])
+
+
+@njit(cache=True, nogil=True)
+def _write_scans(  # type: ignore[no-untyped-def]
+    samples,
+    advance,
+    hop,
+    plan,
+    lanes,
+    spectrum,
+    parts,
+    starts,
+    first,
+    second,
+    sums,
+    spectra,
+    finite,
+):
+    for scan in range(len(spectra)):
+        begin = scan * advance
+        mean = _as_lanes(samples[begin : begin + len(lanes)], lanes)
+        finite[scan] = np.all(np.isfinite(mean))
+        if finite[scan]:
+            _write_parts(lanes, hop, mean, plan, spectrum, parts)
+            _write_sums(parts, starts, first, second, sums, spectra[scan])
+        else:
+            spectra[scan] = 0.0
 
 
 @njit(cache=True, nogil=True)

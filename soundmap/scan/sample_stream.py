@@ -70,9 +70,9 @@ class SampleStream:
             return
         self._block_first.append(self._first + self._filled)
         self._block_time_ns.append(block.time_ns)
-        kind = np.result_type(self._samples, samples)
-        if kind != self._samples.dtype:
-            before, self._samples = self._samples, self._memory(kind)
+        if samples.dtype != self._samples.dtype:
+            before = self._samples
+            self._samples = self._memory(np.result_type(before, samples))
             self._samples[: self._filled] = before[: self._filled]
         while len(samples):
             part = samples[: self._shape[0] - self._filled]

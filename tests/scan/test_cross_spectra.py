@@ -24,9 +24,9 @@ def band_and_table(positions, rate_hz, window, low_hz, high_hz, splits=()):
 
 
 def compiled(samples, framing, table):
-    spectra = np.zeros(table.spectra_shape, dtype=np.float32)
-    assert BaselineSpectra(samples.shape[1], framing, table).add(samples, spectra)
-    return spectra
+    spectra = np.empty((1, *table.spectra_shape), dtype=np.float32)
+    assert BaselineSpectra(samples.shape[1], framing, table).write(samples, 0, spectra).all()
+    return spectra[0]
 
 
 @pytest.mark.parametrize("dtype", ["int16", "int32", "float32", "float64"])
@@ -79,9 +79,10 @@ def test_samples_that_are_not_finite_are_refused_and_leave_nothing_behind(value)
     samples = rng.standard_normal((framing.span, 4))
     broken = samples.copy()
     broken[100, 2] = value
-    maker = BaselineSpectra(4, framing, table)
-    spectra = np.zeros(table.spectra_shape, dtype=np.float32)
-    assert not maker.add(broken, spectra)
-    assert not spectra.any()
-    assert maker.add(samples, spectra)
+    samples = np.concatenate([samples, broken, samples])
+    spectra = np.empty((3, *table.spectra_shape), dtype=np.float32)
+    finite = BaselineSpectra(4, framing, table).write(samples, framing.span, spectra)
+    assert finite.tolist() == [True, False, True]
     assert np.isfinite(spectra).all()
+    assert not spectra[1].any()
+    assert np.array_equal(spectra[0], spectra[2])
