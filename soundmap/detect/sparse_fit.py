@@ -12,7 +12,7 @@ distance, and would pull them off.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from itertools import pairwise
 
@@ -68,6 +68,8 @@ class Component:
     paths : Paths
     column : ndarray of float32, shape (S, D)
         What it adds at strength 1.
+    ways : dict
+        For each `Share` those paths that have it and that any scan hears.
     """
 
     place_m: FloatArray
@@ -77,6 +79,7 @@ class Component:
     strength: FloatArray
     paths: Paths
     column: Single
+    ways: dict[Share, list[int]] = field(default_factory=dict)
 
 
 class SparseFit:
@@ -120,7 +123,7 @@ class SparseFit:
         component = Component(
             place_m, height_m, kind, dict(ASSUMED), nothing, paths, self.residual[:0]
         )
-        component.column = self._column(component)
+        self._hear(component)
         self.components.append(component)
         return component
 
@@ -237,16 +240,16 @@ class SparseFit:
         component.paths = sound_paths(
             self.evidence, self.walls, component.place_m, component.height_m, component.kind
         )
-        component.column = self._column(component)
+        self._hear(component)
 
-    def _column(self, component: Component) -> Single:
-        column = self._heard(component, Path.DIRECT)
-        if component.kind == Kind.IMAGE:
-            return column
-        for share, paths in self._ways(component).items():
+    def _hear(self, component: Component) -> None:
+        """Ways and column of a component that has new paths."""
+        component.ways = self._ways(component)
+        component.column = self._heard(component, Path.DIRECT)
+        for share, paths in component.ways.items():
             for path in paths:
-                column += np.float32(component.shares[share]) * self._heard(component, path)
-        return column
+                heard = self._heard(component, path)
+                component.column += np.float32(component.shares[share]) * heard
 
     def _ways(self, component: Component) -> dict[Share, list[int]]:
         """Paths that have a share, as far as any scan hears them."""
@@ -336,7 +339,7 @@ class SparseFit:
         owners: list[tuple[Component, int]] = []
         for component in chosen:
             if np.count_nonzero(component.paths.gain[Path.DIRECT]) >= 3:
-                owners += [(component, axis) for axis in (0, 1, *self._ways(component))]
+                owners += [(component, axis) for axis in (0, 1, *component.ways)]
         if not owners:
             return np.zeros((0, 0)), np.zeros(0), owners
         count, components, bands = len(owners), len(self.components), len(self.gram)
@@ -374,7 +377,7 @@ class SparseFit:
         for component, axis in owners:
             strength = component.strength[part].astype(np.float32)
             if axis >= 2:
-                paths = self._ways(component)[Share(axis)]
+                paths = component.ways[Share(axis)]
                 yield np.sum([self._heard(component, path, scans) for path in paths], 0) * strength
                 continue
             if axis == 0:  # axis 1 of the same component follows
