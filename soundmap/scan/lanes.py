@@ -3,7 +3,7 @@
 What a scan takes is the same arithmetic on every channel, bin or bearing. Compilers turn loops over
 them into a processor's wide instructions only where they can prove much about memory; here they
 are told. `Lanes` has +, - and *; `load` and `store` move it from and to arrays. A processor whose
-registers are narrower takes it in parts, with the same results.
+registers are narrower takes it in parts; one that cannot multiply and add at once rounds once more.
 
 Arrays lie in memory in C order, positions in them count single numbers from the first, and nobody
 checks them. None of this runs outside of compiled functions.
