@@ -17,14 +17,15 @@ honest variance. Clock and yaw bind all places together; given them, each place 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from soundmap.calibrate.far_field import FarClock
 from soundmap.calibrate.peaks import Peaks
-from soundmap.calibrate.way import Way
+from soundmap.calibrate.way import Way, WayAt
 from soundmap.geometry import FloatArray, wrapped_angle
 
 ROUNDS, DRIFT_ROUNDS = 24, 6
@@ -32,7 +33,7 @@ WIDEST, NARROWING_ROUNDS = 4.0, 8
 """Gates begin so many times wider than they end, to catch what the start has wrong."""
 GATE = 3.0
 """Residuals of so many standard deviations or more have no weight (Tukey's biweight)."""
-DRIFT_RAD, DRIFT_OVER_M = np.radians(0.8), 0.4
+DRIFT_RAD, DRIFT_OVER_M = np.radians(0.5), 0.4
 """Standard deviation of a drift, and the way over which it changes."""
 UNRESOLVED_RAD, UNRESOLVED_SIGMAS = np.radians(8.0), 2.0
 """Peaks of places nearer in bearing than this are one: their bearings are the less certain."""
@@ -52,12 +53,15 @@ class Stretch:
 
     Attributes
     ----------
+    scans : slice
+        Its audio scans.
     first, last : int
         Its peaks are those from ``first`` to before ``last``.
     place_m : ndarray, shape (K, 2)
         Fixed places, in the map frame.
     """
 
+    scans: slice
     first: int
     last: int
     place_m: FloatArray
@@ -101,10 +105,6 @@ class BearingFit:
         return replace(self, stretches=stretches, information=self.information[chosen])
 
 
-WayAt = Callable[[float], Way]
-"""The way of the array over all scans, if its clock is so far behind [s]."""
-
-
 def rigid_fit(
     peaks: Peaks, way_at: WayAt, stretches: Sequence[Stretch], state: Sequence[float]
 ) -> BearingFit:
@@ -134,8 +134,8 @@ def rigid_fit(
     return BearingFit(at, covariance, stretches, np.array(explained), np.zeros(2))
 
 
-def drifting_fit(peaks: Peaks, way_at: WayAt, fit: BearingFit) -> BearingFit:
-    """The same with drifts, from where the rigid fit ended."""
+def drifting_fit(peaks: Peaks, way_at: WayAt, fit: BearingFit, far: FarClock) -> BearingFit:
+    """The same with drifts and with what the far field tells, from where the rigid fit ended."""
     at, stretches = fit.state, fit.stretches
     driven = way_at(float(at[0])).driven_m() / DRIFT_OVER_M
     knots = [
@@ -161,7 +161,8 @@ def drifting_fit(peaks: Peaks, way_at: WayAt, fit: BearingFit) -> BearingFit:
                     for k in range(len(stretch.place_m))
                 ]
             )
-        step, covariance = _common_step(blocks)
+        known = _known(far, at)
+        step, covariance = _common_step(blocks, known)
         stretches = tuple(_moved(s, b, step) for s, b in zip(stretches, blocks, strict=True))
         drifts = [
             drift + np.array([block.own_step(step)[2:] for block in b]).reshape(drift.shape)
@@ -170,7 +171,7 @@ def drifting_fit(peaks: Peaks, way_at: WayAt, fit: BearingFit) -> BearingFit:
         at = np.clip(at + step, -FARTHEST, FARTHEST)
         if np.all(np.abs(step) < SETTLED):
             break
-    return BearingFit(at, covariance, stretches, fit.information, _leaving_one_out(blocks))
+    return BearingFit(at, covariance, stretches, fit.information, _leaving_one_out(blocks, known))
 
 
 @dataclass(frozen=True)
@@ -289,24 +290,38 @@ def _block(
     )
 
 
-def _common_step(blocks: Sequence[Sequence[_Block]]) -> tuple[FloatArray, FloatArray]:
+_Known = tuple[FloatArray, FloatArray]
+"""Information (2, 2) on clock and yaw that is not the places', and its pull (2,)."""
+NOTHING_KNOWN: _Known = (np.diag(DAMPING), np.zeros(2))
+
+
+def _known(far: FarClock, at: FloatArray) -> _Known:
+    information = far.sigma**-2
+    damping, pull = NOTHING_KNOWN
+    clock = np.array([1.0, 0.0])
+    return damping + np.diag(information * clock), pull + information * (far.value - at[0]) * clock
+
+
+def _common_step(
+    blocks: Sequence[Sequence[_Block]], known: _Known = NOTHING_KNOWN
+) -> tuple[FloatArray, FloatArray]:
     """Step of clock and yaw that all places ask for together, and its covariance."""
-    information, pull = np.diag(DAMPING), np.zeros(2)
+    information, pull = known
     for stretch in blocks:
         for block in stretch:
             information = information + block.information
             pull = pull + block.pull
     covariance = np.linalg.inv(information)
-    return np.clip(covariance @ pull, -GREATEST_STEP, GREATEST_STEP), covariance
+    return np.clip(covariance @ pull, -GREATEST_STEP, GREATEST_STEP), np.asarray(covariance)
 
 
-def _leaving_one_out(blocks: Sequence[Sequence[_Block]]) -> FloatArray:
+def _leaving_one_out(blocks: Sequence[Sequence[_Block]], known: _Known) -> FloatArray:
     """Standard deviation of clock and yaw by the jackknife over the places."""
     every = [block for stretch in blocks for block in stretch]
     if len(every) < 2:
         return np.zeros(2)
-    information = np.diag(DAMPING) + sum(block.information for block in every)
-    pull = sum(block.pull for block in every)
+    information = known[0] + sum(block.information for block in every)
+    pull = known[1] + sum(block.pull for block in every)
     without = [np.linalg.solve(information - b.information, pull - b.pull) for b in every]
     return np.std(without, axis=0) * np.sqrt(len(every) - 1.0)
 

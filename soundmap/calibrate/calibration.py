@@ -7,16 +7,24 @@ the sources leave a result too uncertain to be of use.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from soundmap.calibrate.bearing_fit import BearingFit, Stretch, WayAt, drifting_fit, rigid_fit
+from soundmap.calibrate.bearing_fit import BearingFit, Stretch, drifting_fit, rigid_fit
+from soundmap.calibrate.far_field import (
+    UNTOLD,
+    FarClock,
+    Surveyed,
+    array_beam,
+    far_field_clock,
+    level_scans,
+    without_far_field,
+)
 from soundmap.calibrate.peaks import Peaks, beam_blur, clear_peaks
 from soundmap.calibrate.search import ballot, fixed_places, starting_points
-from soundmap.calibrate.way import Way, array_way, moved_apart
+from soundmap.calibrate.way import Way, WayAt, array_way, moved_apart
 from soundmap.config import CalibrateConfig, ScanConfig
 from soundmap.geometry import FloatArray, Trajectory
 from soundmap.sensors import ArrayOffsets, MicArray, Offset, OffsetVerdict
@@ -29,12 +37,15 @@ MARGIN_NS = 250_000_000
 """Poses are needed so long before and after a scan."""
 LEAST_EXTENT_M = 1.0
 """Bearings from a smaller area cross nowhere, whatever the yaw."""
+FAR_FIELD_BLUR = 1.5
+"""In wider beams than this what is near and what is far cannot be told apart."""
 LEAST_EXPLAINED = 0.7
 """Stretches on which less of what was heard comes from fixed places tell nothing."""
 EQUAL_SHARE = 0.02
 """Fits that explain this much less than the best still count as equal to it."""
 SYSTEMATIC = np.array([0.003, np.radians(0.2)])
-"""What the variance of the fit does not know of, as seen on simulated sites [s, rad]."""
+"""What the variance of the fit does not know of, as seen on simulated sites [s, rad]; more where
+the array's beam is wide."""
 YAW_ALONE = np.array([0.0, 1.0])
 """The yaw rests on where the places are, and one that is wrong may pull it; the clock on turns."""
 USEFUL = np.array([0.015, np.radians(1.5)])
@@ -81,11 +92,16 @@ def array_offsets(
     spans = _stretches(way(scans))
     scans = np.concatenate([scans[first:last] for first, last in spans])
     ends = np.cumsum([0, *(last - first for first, last in spans)])
+    level = level_scans(sharp[scans], array)
+
+    def way_at(clock_s: float) -> Way:
+        return way(scans, clock_s)
+
     blur = beam_blur(array.positions_m, sharp.shape[1], low_hz=scan.low_hz, high_hz=scan.high_hz)
-    peaks = clear_peaks(sharp[scans], blur=blur)
-    # An array that hangs upside down has bearings that run clockwise seen from above.
-    peaks = replace(peaks, bearing_rad=array.mount.handedness * peaks.bearing_rad)
-    fits = _fits(peaks, lambda clock_s: way(scans, clock_s), ends)
+    sharp_beam = blur < FAR_FIELD_BLUR
+    near = _without_far_fields(level, way_at(0.0), ends) if sharp_beam else level
+    peaks = clear_peaks(near, blur=blur)
+    fits = _fits(peaks, way_at, ends)
     if not fits:
         return _nothing("no fixed place was heard")
     best = max(fits, key=lambda fit: fit.explained)
@@ -98,10 +114,50 @@ def array_offsets(
             f"({LEAST_EXPLAINED:.0%} is needed)",
             best.explained,
         )
-    final = drifting_fit(peaks, lambda clock_s: way(scans, clock_s), clear)
+    far = _far_clock(level, way_at, clear, array, scan) if sharp_beam else UNTOLD
+    final = drifting_fit(peaks, way_at, clear, far)
     mixed = final.spread * YAW_ALONE
-    sigma = np.sqrt(np.diag(final.covariance) + SYSTEMATIC**2 + doubt**2 + mixed**2)
+    sigma = np.sqrt(np.diag(final.covariance) + (blur * SYSTEMATIC) ** 2 + doubt**2 + mixed**2)
+    sigma[0] *= max(1.0, _disagreement(final, far))
     return _judged(final, sigma, correct=calibrate.mode == "correct")
+
+
+def _without_far_fields(
+    level: NDArray[np.float32], way: Way, ends: NDArray[np.int64]
+) -> NDArray[np.float32]:
+    """Scans without the far field of each stretch."""
+    return np.concatenate(
+        [without_far_field(level[a:b], way.axis_rad[a:b]) for a, b in pairwise(ends.tolist())]
+    )
+
+
+def _far_clock(
+    level: NDArray[np.float32], way_at: WayAt, fit: BearingFit, array: MicArray, scan: ScanConfig
+) -> FarClock:
+    """What the far field tells of the clock where a fit has found what is near."""
+    beam = array_beam(
+        array,
+        level.shape[1],
+        low_hz=scan.low_hz,
+        high_hz=scan.high_hz,
+        speed_of_sound_m_s=scan.speed_of_sound_m_s,
+    )
+    stretches = [
+        Surveyed(stretch.scans.start, beam.harmonics(level[stretch.scans]), stretch.place_m)
+        for stretch in fit.stretches
+    ]
+    clock_s, yaw_rad = fit.state.tolist()
+    return far_field_clock(stretches, way_at, beam, clock_s=clock_s, yaw_rad=yaw_rad)
+
+
+def _disagreement(fit: BearingFit, far: FarClock) -> float:
+    """How far apart bearings and far field have the clock, in standard deviations of both."""
+    variance = float(fit.covariance[0, 0])
+    by_bearings = 1.0 / variance - far.sigma**-2
+    if np.isinf(far.sigma) or by_bearings < 1e-2 / variance:
+        return 0.0
+    clock = (float(fit.state[0]) / variance - far.value * far.sigma**-2) / by_bearings
+    return abs(clock - far.value) / float(np.sqrt(1.0 / by_bearings + far.sigma**2))
 
 
 def _fits(peaks: Peaks, way_at: WayAt, ends: NDArray[np.int64]) -> list[BearingFit]:
@@ -113,8 +169,8 @@ def _fits(peaks: Peaks, way_at: WayAt, ends: NDArray[np.int64]) -> list[BearingF
 
     def fit_from(start: tuple[float, float]) -> BearingFit | None:
         stretches = [
-            Stretch(first, last, fixed_places(votes, *start))
-            for (first, last), votes in zip(pairwise(limits), ballots, strict=True)
+            Stretch(slice(*span), first, last, fixed_places(votes, *start))
+            for span, (first, last), votes in zip(spans, pairwise(limits), ballots, strict=True)
         ]
         stretches = [s for s in stretches if len(s.place_m) and s.last > s.first]
         return rigid_fit(peaks, way_at, stretches, start) if stretches else None

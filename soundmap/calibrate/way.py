@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,10 +38,23 @@ class Way:
     def __len__(self) -> int:
         return len(self.place_m)
 
+    def part(self, scans: slice) -> Way:
+        """The way over some of the scans."""
+        return Way(
+            self.place_m[scans],
+            self.axis_rad[scans],
+            self.velocity_m_s[scans],
+            self.turn_rad_s[scans],
+        )
+
     def driven_m(self) -> FloatArray:
         """Way driven up to each scan [m], shape (S,)."""
         step = np.hypot(*np.diff(self.place_m, axis=0).T)
         return np.concatenate([np.zeros(min(len(self), 1)), np.cumsum(step)])
+
+
+WayAt = Callable[[float], Way]
+"""The way of the array over all scans, if its clock is so far behind [s]."""
 
 
 def array_way(

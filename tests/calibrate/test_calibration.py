@@ -14,7 +14,8 @@ from soundmap.sensors import MicArray, OffsetVerdict
 
 START_NS = 1_700_000_000_000_000_000
 BEARINGS = 2.0 * np.pi * np.arange(120) / 120
-RING_M = 0.155 * np.array([[1.0, 0, 0], [0, 1.0, 0], [-1.0, 0, 0], [0, -1.0, 0]])
+AROUND = 2.0 * np.pi * np.arange(16) / 16
+RING_M = 0.155 * np.stack([np.cos(AROUND), np.sin(AROUND), 0.0 * AROUND], axis=-1)
 LEVEL = Mount.planar(0.1, -0.05, 0.5, 0.3)
 HANGING = Mount(LEVEL.rotation @ np.diag([1.0, -1.0, -1.0]), LEVEL.translation_m)
 SOURCES = ((2.0, -1.5, 8.0), (5.5, 2.5, 10.0), (1.0, 4.5, 6.0))
