@@ -11,8 +11,11 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import small_logs
+import worlds
 
 from soundmap.jobs import _Board, _Reporter
+from soundmap.map_file import map_files
 
 SCRIPT = """
 import os, signal, sys, time
@@ -130,3 +133,36 @@ def test_progress_of_several_logs_is_shown_by_their_names():
         "b.mcap: left open begins, None",
         "b.mcap: left open ends",
     ]
+
+
+def test_two_jobs_write_what_one_after_the_other_write(tmp_path):
+    small_logs.write(tmp_path / "a.mcap")
+    small_logs.write(tmp_path / "b.mcap", small_logs.events()[:-400])
+    (tmp_path / "robot.toml").write_text(small_logs.ARRAY)
+    for name, content in map_files(worlds.room()).items():
+        (tmp_path / name).write_bytes(content)
+    start = ",".join(map(str, small_logs.START))
+    for jobs in ("1", "2"):
+        command = ["process", "a.mcap", "b.mcap", "--jobs", jobs, "--out", f"by{jobs}"]
+        command += ["--map", "map.yaml", "--start-pose", start, "--config", "robot.toml"]
+        command += ["--figures", "none", "--no-cache", "--quiet"]
+        code = "if __name__ == '__main__': from soundmap.cli import main; main()"
+        subprocess.run([sys.executable, "-c", code, *command], cwd=tmp_path, check=True)
+    alone, together = (contents(tmp_path / f"by{jobs}") for jobs in "12")
+    assert {"a/sources.csv", "b/trajectory.tum", "b/audio_scans.npz"} <= set(alone)
+    assert alone["a/sources.csv"].count(b"\n") > 1
+    assert alone == together
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """What all files of some runs hold, but for how long it took and when it was."""
+    files = {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file() and path.suffix != ".html"
+    }
+    for name in [name for name in files if name.endswith("report.json")]:
+        report = json.loads(files[name])
+        del report["timings_s"], report["speed"]
+        files[name] = json.dumps(report).encode()
+    return files
