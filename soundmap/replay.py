@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
@@ -35,6 +34,7 @@ from soundmap.losses import LossLedger
 from soundmap.map_file import read_map
 from soundmap.mapping.geometric_map import BuiltMap, build_map
 from soundmap.measured import Measured, MeasuredCache, measured_key
+from soundmap.memory import give_back, hold_little
 from soundmap.outputs.progress import Progress, Stage
 from soundmap.run import Run
 from soundmap.scan.audio_scan import audio_scans, kept_scans
@@ -45,6 +45,8 @@ from soundmap.surroundings import NO_SURROUNDINGS
 
 MOST_THREADS = 4
 """Threads that turn sound into audio scans; they keep up with any reading of the log."""
+GIVE_BACK_NS = 300_000_000_000
+"""Time of the log after which holes are given back that growing results have left."""
 LEAST_EXTENT_M = 0.5
 """A robot that stays within this cannot tell where sound comes from, only from which side [m]."""
 
@@ -82,6 +84,7 @@ def process(
     SoundmapError
         The log, the map or the configuration does not do.
     """
+    hold_little()
     given = None if map_path is None else read_map(map_path)
     clock = _Stopwatch(progress)
     measured, from_cache = _kept_or_measured(log_path, given, config, start_pose, cache, clock)
@@ -311,12 +314,6 @@ def _audio_of(
             yield item
 
 
-def _give_back_memory() -> None:
-    """Lets the system have what a stage has freed; glibc keeps it unless it is asked."""
-    with suppress(AttributeError, OSError, TypeError):  # another C library
-        ctypes.CDLL(None).malloc_trim(0)
-
-
 class _Stopwatch:
     """Times the stages while it shows their progress."""
 
@@ -329,15 +326,18 @@ class _Stopwatch:
         began = perf_counter()
         with self._progress.stage(name, total_s) as stage:
             yield stage
-        _give_back_memory()
+        give_back()
         self.timings_s[name] = perf_counter() - began
 
 
 def _watched(log: RobotLog, stage: Stage) -> Iterator[AudioBlock | LaserScan]:
     """What was measured, with the progress reported once a second of the log."""
-    start_ns = reported_ns = int(log.odometry.time_ns[0])
+    start_ns = reported_ns = given_back_ns = int(log.odometry.time_ns[0])
     for item in log.measurements():
         if item.time_ns - reported_ns > 1_000_000_000:
             stage.advance_to((item.time_ns - start_ns) * 1e-9)
             reported_ns = item.time_ns
+        if item.time_ns - given_back_ns > GIVE_BACK_NS:
+            give_back()
+            given_back_ns = item.time_ns
         yield item
