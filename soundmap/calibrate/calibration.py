@@ -46,6 +46,8 @@ EQUAL_SHARE = 0.02
 SYSTEMATIC = np.array([0.003, np.radians(0.2)])
 """What the variance of the fit does not know of, as seen on simulated sites [s, rad]; more where
 the array's beam is wide."""
+UNCONFIRMED = np.array([0.006, 0.0])
+"""... and of the clock where bearings alone tell it: a place may be pulled all through a turn."""
 YAW_ALONE = np.array([0.0, 1.0])
 """The yaw rests on where the places are, and one that is wrong may pull it; the clock on turns."""
 USEFUL = np.array([0.015, np.radians(1.5)])
@@ -116,8 +118,9 @@ def array_offsets(
         )
     far = _far_clock(level, way_at, clear, array, scan) if sharp_beam else UNTOLD
     final = drifting_fit(peaks, way_at, clear, far)
+    systematic = np.hypot(blur * SYSTEMATIC, UNCONFIRMED * np.isinf(far.sigma))
     mixed = final.spread * YAW_ALONE
-    sigma = np.sqrt(np.diag(final.covariance) + (blur * SYSTEMATIC) ** 2 + doubt**2 + mixed**2)
+    sigma = np.sqrt(np.diag(final.covariance) + systematic**2 + doubt**2 + mixed**2)
     sigma[0] *= max(1.0, _disagreement(final, far))
     return _judged(final, sigma, correct=calibrate.mode == "correct")
 
