@@ -7,6 +7,11 @@ from numpy.typing import NDArray
 
 from soundmap.geometry import FloatArray, Trajectory, composed, relative, wrapped_angle
 
+SLIP_M, SLIP_RAD = 0.10, np.radians(5.0)
+"""Wheels slipped that contradict two neighbouring poses by more than this, ..."""
+DRIFT = 0.2
+"""... and than the worst drift of any odometry in use [m/m, rad/m and rad/rad]."""
+
 
 def carried_poses(
     time_ns: NDArray[np.int64],
@@ -48,6 +53,25 @@ def carried_poses(
     turn = wrapped_angle(backward[:, 2] - forward[:, 2])
     blended[:, 2] = wrapped_angle(forward[:, 2] + share * turn)
     return blended, before, after
+
+
+def slipped(known_odometry: FloatArray, known_pose: FloatArray) -> NDArray[np.bool_]:
+    """Between which neighbouring poses the wheels slipped, so that nothing can be carried there.
+
+    Parameters
+    ----------
+    known_odometry, known_pose : ndarray, shapes (K, 3)
+        Of the same times, by the odometry and as they are known.
+
+    Returns
+    -------
+    ndarray of bool, shape (K - 1,)
+    """
+    step = relative(known_pose[:-1], known_pose[1:])
+    off = step - relative(known_odometry[:-1], known_odometry[1:])
+    way, turn = np.hypot(step[:, 0], step[:, 1]), np.abs(wrapped_angle(step[:, 2]))
+    is_far = np.hypot(off[:, 0], off[:, 1]) > SLIP_M + DRIFT * way
+    return is_far | (np.abs(wrapped_angle(off[:, 2])) > SLIP_RAD + DRIFT * (way + turn))
 
 
 def motion_progress(odometry: Trajectory) -> FloatArray:

@@ -185,9 +185,15 @@ class Placement:
         return bool(np.median(matched) >= needed and np.median(beyond) <= MOST_BEYOND)
 
     def _spread(self, view: int, start: FloatArray, stretch: NDArray[np.int64]) -> None:
-        """Follow a pose through a stretch; views that match better than before take it."""
+        """Follow a pose through a stretch; views that match better than before take it.
+
+        Where a single wall was seen the start may be off along it, until the robot came to what
+        tells the place; so the way is followed back as well, from the last view that matched.
+        """
         for order in (stretch[stretch >= view], stretch[stretch <= view][::-1]):
             self._take(order, self._follower.followed(order, start, seek=True))
+            for back in _known_pieces(self._views, self.known, order):
+                self._take(back, self._follower.followed(back, self.pose[back[0]]))
 
     def _take(self, order: NDArray[np.int64], track: Track) -> None:
         better = track.support > (self.matched - self.beyond)[order]
@@ -226,6 +232,16 @@ def _stretches(views: Views, lost: NDArray[np.bool_]) -> Iterator[NDArray[np.int
         took_s = (views.time_ns[end - 1] - views.time_ns[begin]) * 1e-9
         if way_m >= LOST_M or took_s >= LOST_S:
             yield np.arange(begin, end)
+
+
+def _known_pieces(
+    views: Views, known: NDArray[np.bool_], order: NDArray[np.int64]
+) -> list[NDArray[np.int64]]:
+    """Pieces of the way that matched without a long break, each from its end back to its begin."""
+    index = np.flatnonzero(known[order])
+    gap_m = np.abs(np.diff(views.driven_m[order[index]]))
+    pieces = np.split(index, np.flatnonzero(gap_m > LOST_M) + 1)
+    return [order[piece[0] : piece[-1] + 1][::-1] for piece in pieces if len(piece)]
 
 
 def _tears(views: Views, pose: FloatArray, known: NDArray[np.bool_]) -> list[tuple[int, int]]:

@@ -23,7 +23,7 @@ from soundmap.localize.placement import (
 )
 from soundmap.localize.smoothing import SmoothedPoses, carried, smoothed_poses
 from soundmap.localize.tracking import Tracker
-from soundmap.localize.trust import bridged, without_scraps
+from soundmap.localize.trust import bridged, slipping, without_scraps
 from soundmap.localize.views import STAGE, Views, chosen_views
 from soundmap.localize.wall_fit import WallFit
 from soundmap.losses import LossLedger
@@ -169,6 +169,7 @@ def _smoothed(
             both = trusted[:-1] & trusted[1:]
             found = relative(pose[:-1], pose[1:])
             model = _not_too_sure(fitted_odometry(reported[both], found[both], model), config)
+    trusted = trusted & ~slipping(views.time_ns, pose, reported)
     return Estimate(pose, trusted, agreed.matched, agreed.beyond, result.covariance)
 
 

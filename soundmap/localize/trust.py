@@ -11,6 +11,9 @@ from soundmap.localize.smoothing import chained
 
 TORN_M, TORN_RAD = 0.5, np.radians(30.0)
 """A step that differs so much from that of the odometry tears the trajectory."""
+SLIP_NS = 100_000_000
+SLIP_RAD_S = 1.0
+"""Wheels slip that report a turn rate so far from the true one over at least so long."""
 BRIDGE_M = 0.3
 """A robot that is known before and after so short a way was not lost on it."""
 
@@ -71,6 +74,32 @@ def without_scraps(
     kept = np.zeros_like(trusted)
     kept[index[is_proved[piece]]] = True
     return kept
+
+
+def slipping(time_ns: NDArray[np.int64], pose: FloatArray, step: FloatArray) -> NDArray[np.bool_]:
+    """Which poses fall in a moment in which the wheels reported a false turn: scans are bent then.
+
+    The rays of a scan are put together by the odometry. A false way shifts them by centimetres at
+    most, a false turn by degrees.
+
+    Parameters
+    ----------
+    time_ns : ndarray of int64, shape (K,)
+    pose : ndarray, shape (K, 3)
+    step : ndarray, shape (K - 1, 3)
+        Motion from each pose to the next according to the odometry.
+    """
+    odometry, count = chained(step), len(pose)
+    before = np.arange(count)
+    after = np.searchsorted(time_ns, time_ns + SLIP_NS)
+    before, after = before[after < count], after[after < count]
+    turn = pose[after, 2] - pose[before, 2]
+    off = wrapped_angle(turn - (odometry[after, 2] - odometry[before, 2]))
+    is_false = np.abs(off) > SLIP_RAD_S * 1e-9 * (time_ns[after] - time_ns[before])
+    edges = np.zeros(count + 1, dtype=np.int64)
+    np.add.at(edges, before[is_false], 1)
+    np.add.at(edges, after[is_false] + 1, -1)
+    return np.cumsum(edges)[:-1] > 0
 
 
 def _is_torn(

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from soundmap.carrying import carried_poses, odometry_times_between
+from soundmap.carrying import carried_poses, odometry_times_between, slipped
 from soundmap.config import MappingConfig
 from soundmap.geometry import FloatArray, Trajectory, composed, inverted, relative
 from soundmap.grid import OccupancyGrid
@@ -355,5 +355,6 @@ def carried_trajectory(
     between = odometry_times_between(scan_ns, odometry, rare_ns=RARE_NS)
     time_ns = np.union1d(scan_ns, between)
     carried, before, after = carried_poses(time_ns, odometry, key_ns, pose)
-    usable = matched[before] | matched[after]
+    slips = np.concatenate([[False], slipped(odometry.at(key_ns), pose), [False]])
+    usable = (matched[before] | matched[after]) & ~(slips[after] | slips[before + 1])
     return Trajectory(time_ns, carried, usable, is_scan=np.isin(time_ns, scan_ns))

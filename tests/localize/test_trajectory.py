@@ -11,6 +11,7 @@ from soundmap.geometry import Trajectory, composed, relative, wrapped_angle
 from soundmap.grid import GridFrame, OccupancyGrid
 from soundmap.localize.global_start import start_hypotheses
 from soundmap.localize.placement import Placement
+from soundmap.localize.smoothing import chained
 from soundmap.localize.trajectory import estimate_trajectory
 from soundmap.localize.views import chosen_views
 from soundmap.losses import LossLedger
@@ -395,3 +396,15 @@ def test_a_robot_that_was_carried_elsewhere_is_left_there():
     off = moved.pose - placement.pose
     assert np.hypot(off[:, 0], off[:, 1])[moved.known].max() < 0.1
     assert moved.known.mean() > 0.9
+
+
+def test_a_wheel_that_slips_half_a_metre_leaves_right_poses_or_flagged_ones():
+    odometry = odometry_of(TRUTH)
+    step = relative(odometry.pose[:-1], odometry.pose[1:])
+    step[300:310] += [0.025, 0.0, 0.15]  # 1.5 rad in 0.2 s
+    slipped = Trajectory(TRUTH.time_ns, chained(step), TRUTH.usable)
+    estimate = estimate_trajectory(SCANS, slipped, ROOM, CONFIG)
+    position, turn = errors(estimate)
+    assert 0.9 < estimate.usable.mean() < 1.0
+    assert position[estimate.usable].max() < 0.1
+    assert np.degrees(turn[estimate.usable].max()) < 1.5

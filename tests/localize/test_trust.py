@@ -1,7 +1,7 @@
 import numpy as np
 
 from soundmap.geometry import composed
-from soundmap.localize.trust import bridged, without_scraps
+from soundmap.localize.trust import bridged, slipping, without_scraps
 
 VIEWS = 41
 STEP = np.tile([0.5, 0.0, 0.0], (VIEWS - 1, 1))
@@ -79,3 +79,20 @@ def test_views_between_matching_ones_are_bridged_over_little_way_only():
     matching = np.array([True, False, True, False, True, False])
     way_m = np.array([0.0, 0.1, 0.2, 0.5, 1.0, 1.0])
     assert bridged(matching, way_m).tolist() == [True, True, True, False, True, False]
+
+
+def slips(turn_deg: float, *, every_ns: int) -> list[int]:
+    """Views in doubt where the odometry reports one false turn, from view 20 to 21."""
+    step = STEP.copy()
+    step[20, 2] += np.radians(turn_deg)
+    return np.flatnonzero(slipping(np.arange(VIEWS) * every_ns, TRUE, step)).tolist()
+
+
+def test_scans_in_which_the_wheels_reported_a_false_turn_are_not_trusted():
+    assert slips(20.0, every_ns=100_000_000) == [20, 21]
+    assert slips(20.0, every_ns=50_000_000) == [19, 20, 21, 22]
+
+
+def test_a_small_or_slow_false_turn_is_drift():
+    assert slips(4.0, every_ns=100_000_000) == []
+    assert slips(20.0, every_ns=500_000_000) == []

@@ -107,6 +107,17 @@ def test_between_key_scans_the_correction_is_spread_over_the_way():
     assert found.usable[:10].all()
 
 
+def test_where_the_wheels_slipped_between_key_scans_nothing_is_carried():
+    """Half a metre and a third of a turn that only the odometry knows of."""
+    time_ns = np.arange(41, dtype=np.int64) * 10**8
+    way = np.column_stack([np.arange(41) * 0.1, np.zeros((41, 2))])
+    slipped = np.concatenate([way[:25], composed(np.array([0.25, 0.0, 2.0]), way[25:])])
+    odometry = Trajectory(time_ns, slipped, np.ones(41, dtype=bool))
+    keys = np.array([0, 10, 20, 30, 40])
+    found = carried_trajectory(time_ns, odometry, time_ns[keys], way[keys], np.ones(5, bool))
+    assert np.flatnonzero(~found.usable).tolist() == list(range(20, 31))
+
+
 def test_rare_scans_are_joined_by_the_poses_of_the_odometry():
     odometry = Trajectory(
         np.arange(101, dtype=np.int64) * 10**8, np.zeros((101, 3)), np.ones(101, dtype=bool)
