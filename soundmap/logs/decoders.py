@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from soundmap.logs.audio_messages import PACKET_READERS
-from soundmap.logs.fixed_layouts import FIXED_LAYOUTS, FixedReader
+from soundmap.logs.fixed_layouts import FIXED_LAYOUTS, FixedReader, is_little_endian
 from soundmap.logs.laser_messages import SWEEP_READERS
 from soundmap.logs.messages import Form, form_of
 from soundmap.logs.odometry import odometry_reading
@@ -85,7 +85,7 @@ def _reader(kind: MessageType, name: str) -> Decoder:
 def _with_shortcut(fixed: FixedReader, general: Decoder) -> Decoder:
     def reader(data: memoryview) -> Any:
         try:
-            reading = fixed(data)
+            reading = fixed(data) if is_little_endian(data) else None
         except (struct.error, ValueError, IndexError):
             reading = None
         return general(data) if reading is None else reading

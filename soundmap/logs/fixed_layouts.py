@@ -21,8 +21,8 @@ from soundmap.logs.odometry import OdometryReading
 from soundmap.logs.transforms import Transform
 
 FixedReader = Callable[[memoryview], Any]
-"""Makes of a message what the reader of its form makes; None, or struct.error, ValueError or
-IndexError, if that is left to the general decoder."""
+"""Makes of a message with the low byte first what the reader of its form makes; None, or
+struct.error, ValueError or IndexError, if that is left to the general decoder."""
 
 ENCAPSULATION = 4
 """Bytes before the message itself: from here on, numbers are aligned to their size."""
@@ -36,8 +36,7 @@ def _numbers(prefix: str, names: str, kind: str = "float64") -> tuple[str, ...]:
     return tuple(f"{prefix}{name} {kind}" for name in names.split())
 
 
-_HEADER, _LENGTH = struct.Struct("<iII"), struct.Struct("<I")
-"""Seconds, nanoseconds and the length of the frame's name; the length of anything."""
+_STAMP, _LENGTH = struct.Struct("<iI"), struct.Struct("<I")
 _AUDIO = struct.Struct("<IIII")
 _SCAN = struct.Struct("<fffffffI")
 _POSE, _TWIST = struct.Struct("<7d"), struct.Struct("<6d")
@@ -45,8 +44,9 @@ _COVARIANCE_BYTES = 36 * 8
 _RANGE = np.dtype("<f4")
 
 
-def _is_little_endian(data: memoryview) -> bool:
-    return data[0] == 0 and data[1] == 1
+def is_little_endian(data: memoryview) -> bool:
+    """Whether a message is CDR with the low byte first."""
+    return len(data) > ENCAPSULATION and data[0] == 0 and data[1] == 1
 
 
 def _is_all(data: memoryview, end: int) -> bool:
@@ -54,34 +54,39 @@ def _is_all(data: memoryview, end: int) -> bool:
     return 0 <= len(data) - end <= MOST_SURPLUS
 
 
-def _text(data: memoryview, start: int, length: int) -> str:
-    """A string of that length with the nought at its end."""
-    end = start + length
-    if length < 1 or end > len(data) or data[end - 1] != 0:
-        raise ValueError("not a string")
-    return bytes(data[start : end - 1]).decode()
-
-
 def _aligned(place: int, size: int) -> int:
     return place + (ENCAPSULATION - place) % size
 
 
-def _audio_frame(data: memoryview) -> AudioPacket | None:
-    if not _is_little_endian(data):
-        return None
-    seconds, nanoseconds, length = _HEADER.unpack_from(data, ENCAPSULATION)
-    frame_id = _text(data, 16, length)
-    place = _aligned(16 + length, 4)
+def _string(data: memoryview, place: int) -> tuple[str, int]:
+    """The string that comes next, and where it ends."""
+    place = _aligned(place, 4)
     (length,) = _LENGTH.unpack_from(data, place)
-    encoding = _text(data, place + 4, length)
-    place = _aligned(place + 4 + length, 4)
+    end = place + _LENGTH.size + length
+    if length < 1 or end > len(data) or data[end - 1] != 0:
+        raise ValueError("not a string")
+    return bytes(data[place + _LENGTH.size : end - 1]).decode(), end
+
+
+def _header(data: memoryview, place: int) -> tuple[int, str, int]:
+    """Stamp [ns] and frame of the header that comes next, and where it ends."""
+    place = _aligned(place, 4)
+    seconds, nanoseconds = _STAMP.unpack_from(data, place)
+    frame_id, end = _string(data, place + _STAMP.size)
+    return seconds * 1_000_000_000 + nanoseconds, frame_name(frame_id), end
+
+
+def _audio_frame(data: memoryview) -> AudioPacket | None:
+    stamp_ns, frame_id, place = _header(data, ENCAPSULATION)
+    encoding, place = _string(data, place)
+    place = _aligned(place, 4)
     channels, rate_hz, frames, size = _AUDIO.unpack_from(data, place)
     start = place + _AUDIO.size
     if not _is_all(data, start + size):
         return None
     return frame_packet(
-        seconds * 1_000_000_000 + nanoseconds,
-        frame_name(frame_id),
+        stamp_ns,
+        frame_id,
         AudioEncoding(encoding, channels, float(rate_hz)),
         frames,
         data[start : start + size],
@@ -89,60 +94,39 @@ def _audio_frame(data: memoryview) -> AudioPacket | None:
 
 
 def _laser_scan(data: memoryview) -> LaserSweep | None:
-    if not _is_little_endian(data):
-        return None
-    seconds, nanoseconds, length = _HEADER.unpack_from(data, ENCAPSULATION)
-    frame_id = _text(data, 16, length)
-    place = _aligned(16 + length, 4)
+    stamp_ns, frame_id, place = _header(data, ENCAPSULATION)
+    place = _aligned(place, 4)
     first, last, step, interval, _, least, greatest, count = _SCAN.unpack_from(data, place)
     start = place + _SCAN.size
     (intensities,) = _LENGTH.unpack_from(data, start + 4 * count)
     if not _is_all(data, start + 4 * (count + 1 + intensities)):
         return None
-    return laser_sweep(
-        seconds * 1_000_000_000 + nanoseconds,
-        frame_name(frame_id),
-        (first, last, step, interval, least, greatest),
-        np.frombuffer(data, _RANGE, count, start),
-    )
+    numbers = (first, last, step, interval, least, greatest)
+    return laser_sweep(stamp_ns, frame_id, numbers, np.frombuffer(data, _RANGE, count, start))
 
 
 def _odometry(data: memoryview) -> OdometryReading | None:
-    if not _is_little_endian(data):
-        return None
-    seconds, nanoseconds, length = _HEADER.unpack_from(data, ENCAPSULATION)
-    parent = _text(data, 16, length)
-    place = _aligned(16 + length, 4)
-    (length,) = _LENGTH.unpack_from(data, place)
-    child = _text(data, place + 4, length)
-    place = _aligned(place + 4 + length, 8)
+    stamp_ns, parent, place = _header(data, ENCAPSULATION)
+    child, place = _string(data, place)
+    place = _aligned(place, 8)
     pose = _POSE.unpack_from(data, place)
     place += _POSE.size + _COVARIANCE_BYTES
     x, y, z, _, _, turn = _TWIST.unpack_from(data, place)
     if not _is_all(data, place + _TWIST.size + _COVARIANCE_BYTES):
         return None
-    stamp_ns = seconds * 1_000_000_000 + nanoseconds
-    return OdometryReading(stamp_ns, frame_name(parent), frame_name(child), (*pose, x, y, z, turn))
+    return OdometryReading(stamp_ns, parent, frame_name(child), (*pose, x, y, z, turn))
 
 
 def _transforms(data: memoryview) -> list[Transform] | None:
-    if not _is_little_endian(data):
-        return None
     (count,) = _LENGTH.unpack_from(data, ENCAPSULATION)
     found, place = [], ENCAPSULATION + _LENGTH.size
     for _ in range(count):
-        place = _aligned(place, 4)
-        seconds, nanoseconds, length = _HEADER.unpack_from(data, place)
-        place += _HEADER.size
-        parent = _text(data, place, length)
-        place = _aligned(place + length, 4)
-        (length,) = _LENGTH.unpack_from(data, place)
-        child = _text(data, place + 4, length)
-        place = _aligned(place + 4 + length, 8)
+        stamp_ns, parent, place = _header(data, place)
+        child, place = _string(data, place)
+        place = _aligned(place, 8)
         pose = _POSE.unpack_from(data, place)
         place += _POSE.size
-        stamp_ns = seconds * 1_000_000_000 + nanoseconds
-        found.append((frame_name(parent), frame_name(child), stamp_ns, pose))
+        found.append((parent, frame_name(child), stamp_ns, pose))
     return found if _is_all(data, place) else None
 
 
