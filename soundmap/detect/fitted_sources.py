@@ -38,10 +38,10 @@ from soundmap.sound import AudioScans, Source, SourceFit, SourceList
 LEAST_SCANS = 8
 LEAST_NOISE = 0.5
 """What is explained counts in units of what is left, but of no less than this of the noise."""
-ONE_SOURCE_M = 0.55
-"""Components nearer to each other than this are one source."""
+ONE_SOURCE_M = 0.45
+"""Components placed nearer to each other than this are one source."""
 VAGUE_M = 0.5
-"""A source is somewhere: within so much of where it is reported, with 95 %."""
+"""A source is somewhere: within so much of where it is reported [m], with 95 %."""
 STRETCH_M = 0.5
 ONE_SIDE_RAD = np.radians(40.0)
 LOUD_SIDE = 0.75
@@ -147,9 +147,8 @@ def _told(
     marks = Marks(
         gain=np.array([fit.gain(index) / noise for index in range(len(components))]),
         steadiness=steadiness(fit, stretch),
-        area_m2=np.sqrt([np.linalg.det(place.covariance_m2) for place in places]),
+        surface_odds=np.array([place.surface_odds for place in places]),
         behind_m=np.array([_behind_m(component) for component in components]),
-        on_surface=np.array([place.on_surface for place in places]),
     )
     told = [
         _Told(index, component, float(gain), place, float(probability))
@@ -166,7 +165,7 @@ def _strongest_apart(told: Sequence[_Told]) -> list[_Told]:
     for each in told:
         if each.component.kind == Kind.IMAGE:
             continue
-        apart = [np.hypot(*(other.component.place_m - each.component.place_m)) for other in kept]
+        apart = [np.hypot(*(other.placement.place_m - each.placement.place_m)) for other in kept]
         if min(apart, default=np.inf) > ONE_SOURCE_M:
             kept.append(each)
     return kept

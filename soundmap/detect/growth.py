@@ -15,6 +15,7 @@ from soundmap.detect.matched_filter import (
     explained,
     matched_scans,
 )
+from soundmap.detect.relocation import relocate
 from soundmap.detect.sound_paths import Kind, Path
 from soundmap.detect.sparse_fit import Component, SparseFit
 from soundmap.geometry import FloatArray
@@ -33,8 +34,9 @@ IN_VIEW_SHARE = 0.7
 """An image becomes a source if as such it explains at least this share of what it and all within
 `BESIDE_M` of it did."""
 HEIGHTS_TRIED_M = (0.1, 0.3, 0.6, 1.0, 1.4)
-MERGE_SHARE = 0.4
-"""They are, if one in their midst loses less than this share of what the lesser of both gains."""
+MERGE_SHARE, JOINT_SHARE = 0.4, 0.1
+"""They are, if one in their midst loses less than this share of what the lesser of both gains, or
+of what both gain together: two that share one source gain little each."""
 STEPS = 4
 GROWTH_SCANS = 120
 """About as many scans tell where components are; all of them place and weigh these."""
@@ -52,6 +54,7 @@ def grown_fit(evidence: Evidence, walls: FloatArray, candidates: Candidates) -> 
     stride = max(round(len(evidence) / GROWTH_SCANS), 1)
     few = evidence if stride == 1 else evidence.chosen(np.arange(0, len(evidence), stride))
     fit = _grown(few, walls, candidates, LEAST_GAIN / stride)
+    relocate(fit, candidates)
     if stride > 1:
         fit = _with_all_scans(fit, evidence)
     _merge(fit)
@@ -142,17 +145,19 @@ def _merge(fit: SparseFit) -> None:
         first, second = pair
         tried.append(pair)
         before, kept = fit.misfit, copy.copy(fit.components)
-        worth = min(fit.gain(kept.index(each)) for each in pair)
-        weight = np.array([_energy(fit, first), _energy(fit, second)])
+        lesser = min(fit.gain(kept.index(each)) for each in pair)
+        others = [c for c in kept if c is not first and c is not second]
+        may_lose = max(MERGE_SHARE * lesser, JOINT_SHARE * (fit.misfit_of(others) - before))
+        weight = np.array([fit.energy(first), fit.energy(second)])
         share = weight / max(weight.sum(), 1e-30)
         louder = first if weight[0] >= weight[1] else second
-        fit.components = [c for c in kept if c is not first and c is not second]
+        fit.components = others
         middle = share[0] * first.place_m + share[1] * second.place_m
         joint = fit.add(middle, louder.height_m, louder.kind)
         fit.refit()
         for _ in range(STEPS):
             fit.move([joint])
-        if fit.misfit - before > MERGE_SHARE * worth:
+        if fit.misfit - before > may_lose:
             fit.components = kept
             fit.refit()
 
@@ -168,8 +173,3 @@ def _nearest_pair(
             if away < least and (first, second) not in tried:
                 best, least = (first, second), away
     return best
-
-
-def _energy(fit: SparseFit, component: Component) -> float:
-    strength = component.strength[fit.evidence.table.part]
-    return float(np.sum((component.column * strength) ** 2))

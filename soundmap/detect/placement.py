@@ -38,13 +38,18 @@ class Placement:
         [m]
     covariance_m2 : ndarray, shape (2, 2)
         [m^2]
-    on_surface : bool
-        Whether it is more likely on a surface that lasers saw than in the open.
+    surface_odds : float
+        How much likelier it is on a surface that lasers saw than in the open.
     """
 
     place_m: FloatArray
     covariance_m2: FloatArray
-    on_surface: bool
+    surface_odds: float
+
+    @property
+    def on_surface(self) -> bool:
+        """Whether it is more likely on a surface than not."""
+        return self.surface_odds > 1.0
 
 
 def placement(
@@ -85,15 +90,15 @@ def placement(
     weight = HIT_CELL_M * odds[near] * np.exp(-0.5 * away)
     in_open = 2.0 * np.pi * np.sqrt(np.linalg.det(open_covariance))
     total = float(weight.sum())
-    probability = total / (total + in_open)
     if total <= 0.0:
-        return Placement(place_m, open_covariance, False)
+        return Placement(place_m, open_covariance, 0.0)
+    probability = total / (total + in_open)
     mean = weight @ step / total
     spread = (step - mean).T @ ((step - mean) * (weight / total)[:, None])
     on_surface = spread + SURFACE_SIGMA_M**2 * np.eye(2)
     covariance = probability * on_surface + (1.0 - probability) * open_covariance
     covariance += probability * (1.0 - probability) * np.outer(mean, mean)
-    return Placement(place_m + probability * mean, covariance, probability > 0.5)
+    return Placement(place_m + probability * mean, covariance, total / in_open)
 
 
 def surface_odds(surface_m: FloatArray, room: OccupancyGrid | None) -> FloatArray:

@@ -32,6 +32,9 @@ cabinets radiate little to their backs."""
 LEAST_SHARE, GREATEST_SHARE = 0.0, 1.0
 HOLD = 100.0
 """How firmly a place is held where it is while it moves [1/m^2]."""
+MAY_BE_BEHIND_M, HOLD_BEHIND = 0.03, 3000.0
+"""A source farther behind a surface than this [m] is drawn back to it so firmly [1/m^2]: what the
+lasers see hides what lies behind, and reflections in the wall pull sources into it."""
 
 
 class Share(IntEnum):
@@ -70,6 +73,8 @@ class Component:
         What it adds at strength 1.
     ways : dict
         For each `Share` those paths that have it and that any scan hears.
+    weighted : ndarray of float32, shape (S, D), optional
+        Its column times the precision that is `weighted_by`; kept since refits are many.
     """
 
     place_m: FloatArray
@@ -80,6 +85,8 @@ class Component:
     paths: Paths
     column: Single
     ways: dict[Share, list[int]] = field(default_factory=dict)
+    weighted: Single | None = None
+    weighted_by: Precision | None = None
 
 
 class SparseFit:
@@ -132,6 +139,24 @@ class SparseFit:
         others = [i for i in range(len(self.components)) if i != index]
         return self._misfit(others) - self.misfit
 
+    def sound(self, component: Component) -> Single:
+        """What a component adds to the scans, shape (S, D)."""
+        strength = component.strength[self.evidence.table.part].astype(np.float32)
+        return np.asarray(component.column * strength)
+
+    def energy(self, component: Component) -> float:
+        """Of all that a component adds to the scans."""
+        return float(np.sum(self.sound(component) ** 2))
+
+    def weighted_columns(self) -> Single:
+        r""":math:`\Sigma^{-1}` times the columns of all components, shape (K, S, D)."""
+        new = [each for each in self.components if each.weighted_by is not self.precision]
+        if new:
+            weighted = self.precision.times(np.stack([each.column for each in new]))
+            for component, own in zip(new, weighted, strict=True):
+                component.weighted, component.weighted_by = own, self.precision
+        return np.stack([each.weighted for each in self.components if each.weighted is not None])
+
     def misfit_of(self, components: list[Component]) -> float:
         """What would be left if there were only some of the components."""
         return self._misfit([i for i, each in enumerate(self.components) if each in components])
@@ -146,7 +171,7 @@ class SparseFit:
     def refit(self) -> None:
         """All strengths anew; silent components go."""
         self._fit_strengths()
-        kept = [c for c in self.components if c.strength.any()]
+        kept = [c for c in self.components if c.strength.any() and c.column.any()]
         if len(kept) < len(self.components):
             self.components = kept
             self._fit_strengths()
@@ -172,9 +197,8 @@ class SparseFit:
 
     def choose_height(self, component: Component, heights_m: tuple[float, ...]) -> None:
         """The height at which a component explains most, all else as it is."""
-        part, starts = self.evidence.table.part, self.evidence.table.starts[:-1]
-        own = component.column * component.strength[part].astype(np.float32)
-        target = self.residual + own
+        starts = self.evidence.table.starts[:-1]
+        target = self.residual + self.sound(component)
         best, value, columns = component.height_m, -np.inf, []
         for height in heights_m:
             component.height_m = height
@@ -222,9 +246,8 @@ class SparseFit:
             NaN where nothing is told.
         """
         component = self.components[index]
-        part = self.evidence.table.part
-        own = self.residual + component.column * component.strength[part].astype(np.float32)
-        weighted = self.precision.times(component.column)
+        own = self.residual + self.sound(component)
+        weighted = self.weighted_columns()[index]
         starts = self.evidence.table.starts[:-1]
         product = np.add.reduceat(weighted * own, starts, axis=1)
         energy = np.add.reduceat(weighted * component.column, starts, axis=1)
@@ -245,6 +268,7 @@ class SparseFit:
     def _hear(self, component: Component) -> None:
         """Ways and column of a component that has new paths."""
         component.ways = self._ways(component)
+        component.weighted = component.weighted_by = None
         component.column = self._heard(component, Path.DIRECT)
         for share, paths in component.ways.items():
             for path in paths:
@@ -286,16 +310,15 @@ class SparseFit:
             self._product = np.zeros((evidence.sub_bands, 0))
             return
         columns = np.stack([component.column for component in self.components])
-        self.gram, self._product = self._products(columns, self.precision.times(columns))
+        self.gram, self._product = self._products(columns, self.weighted_columns())
         strengths = np.zeros((count, evidence.sub_bands))
         for band, (gram, product) in enumerate(zip(self.gram, self._product, strict=True)):
             root, scale = _scaled_root(gram)
             solved, _ = nnls(root.T, np.linalg.solve(root, product * scale))
             strengths[:, band] = solved * scale
-        part = evidence.table.part
         for component, strength in zip(self.components, strengths, strict=True):
             component.strength = strength
-            self.residual -= component.column * strength[part].astype(np.float32)
+            self.residual -= self.sound(component)
 
     def _products(self, columns: Single, weighted: Single) -> tuple[FloatArray, FloatArray]:
         """Gram matrices (B, K, K) of columns, and their products (B, K) with what was heard."""
@@ -369,7 +392,25 @@ class SparseFit:
             if axis >= 2:
                 share = Share(axis)
                 gradient[position] -= hold * (component.shares[share] - ASSUMED[share])
+            elif axis == 0:
+                self._hold_in_view(component, slice(position, position + 2), hessian, gradient)
         return hessian, gradient, owners
+
+    def _hold_in_view(
+        self, component: Component, own: slice, hessian: FloatArray, gradient: FloatArray
+    ) -> None:
+        """Hold a source that lies behind what the lasers see in front of it."""
+        gain, beyond = component.paths.gain[Path.DIRECT], component.paths.beyond_m
+        told = np.isfinite(beyond) & (gain > 0.0)
+        if component.kind == Kind.IMAGE or not told.any():
+            return
+        weight = gain[told] ** 2 / np.sum(gain[told] ** 2)
+        away = component.place_m - self.evidence.place_m[told]
+        toward = weight @ (away / np.maximum(np.hypot(*away.T), NEAREST_M)[:, None])
+        behind = float(weight @ beyond[told]) - MAY_BE_BEHIND_M
+        if behind > 0.0:
+            hessian[own, own] += HOLD_BEHIND * np.outer(toward, toward)
+            gradient[own] -= HOLD_BEHIND * behind * toward
 
     def _derivatives(self, owners: list[tuple[Component, int]], scans: slice) -> Iterator[Single]:
         """Change of what some scans hear with each unknown, each (s, D)."""

@@ -38,11 +38,10 @@ def steadiness(fit: SparseFit, stretch: NDArray[np.int64]) -> FloatArray:
         Number of the stretch of the way that each scan was taken in.
     """
     stretches = int(stretch.max()) + 1
-    columns = np.stack([component.column for component in fit.components])
     strengths = np.array([component.strength for component in fit.components])
-    pulls = fit.precision.times(columns) * fit.residual
-    total = np.zeros(len(columns))
-    pulled = np.zeros((len(columns), stretches))
+    pulls = fit.weighted_columns() * fit.residual
+    total = np.zeros(len(pulls))
+    pulled = np.zeros((len(pulls), stretches))
     edges = pairwise(fit.evidence.table.starts)
     for (start, stop), gram, strength in zip(edges, fit.gram, strengths.T, strict=True):
         pull = pulls[:, :, start:stop].sum(axis=2, dtype=np.float64)

@@ -1,90 +1,15 @@
-"""Scans made by a sum over sources and images in a rectangular room, with exact laser ranges."""
+"""The fit of sources to scans from a rectangular room."""
 
 import numpy as np
 import pytest
 
 from soundmap.config import DetectConfig, ScanConfig
 from soundmap.detect.fitted_sources import _loud_side, fitted_sources
-from soundmap.geometry import Mount, Trajectory
-from soundmap.sensors import MicArray
-from soundmap.sound import AudioScans, LevelReference
-
-WIDTH, DEPTH = 6.0, 5.0
-ANGLE = 2.0 * np.pi * np.arange(16) / 16
-POSITIONS = np.stack([0.155 * np.cos(ANGLE), 0.155 * np.sin(ANGLE), 0.0 * ANGLE], axis=-1)
-MOUNT = Mount.planar(0.1, 0.0, 0.5, 0.3)
+from tests.detect.box_room import observed
 
 
-def way(speed_m_s=0.3):
-    """Half a lap through the room in 20 s, with a turn in the middle."""
-    time_s = np.arange(0.0, 20.0, 0.05)
-    along = speed_m_s * time_s
-    x = np.where(along < 3.0, 1.5 + along, 4.5)
-    y = np.where(along < 3.0, 1.5, 1.5 + np.minimum(along - 3.0, 2.0))
-    heading = np.clip((along - 2.7) / 0.6, 0.0, 1.0) * 0.5 * np.pi
-    time_ns = (1_700_000_000 * 10**9 + time_s * 1e9).astype(np.int64)
-    pose = np.column_stack([x, y, heading])
-    return Trajectory(time_ns, pose, np.ones(len(pose), dtype=bool))
-
-
-def response(toward, aperture=1.0):
-    """Power of the beamformer's output on 120 bearings for waves from ``toward``, white sound.
-
-    Of each sub-band, shape (4, 120).
-    """
-    looking = 2.0 * np.pi * np.arange(120) / 120
-    edges = ScanConfig().sub_band_hz
-    total = np.zeros((4, 120))
-    for hertz in np.arange(1062.5, 6000.0, 125.0):
-        k = 2.0 * np.pi * hertz / 343.0
-        wave = np.exp(
-            1j
-            * k
-            * aperture
-            * (np.cos(toward) * POSITIONS[:, 0] + np.sin(toward) * POSITIONS[:, 1])
-        )
-        steer = np.exp(1j * k * (np.outer(np.cos(looking), POSITIONS[:, 0])
-                                 + np.outer(np.sin(looking), POSITIONS[:, 1])))  # fmt: skip
-        total[np.searchsorted(edges, hertz) - 1] += np.abs(steer.conj() @ wave / 16) ** 2
-    return total / 40
-
-
-def run(emitters, *, ambient=1.0, seed=1, speed_m_s=0.3):
-    """Audio scans and laser ranges of the way; emitters are x, y and power at 1 m."""
-    rng = np.random.default_rng(seed)
-    track = way(speed_m_s)
-    time_ns = track.time_ns[2:-2:2]
-    power, ranges = [], []
-    for pose in track.at(time_ns):
-        turn = pose[2] + MOUNT.yaw_rad
-        place = pose[:2] + 0.1 * np.array([np.cos(pose[2]), np.sin(pose[2])])
-        heard = ambient * np.tile([[0.2], [0.2], [0.3], [0.3]], 120)
-        for x, y, strength in emitters:
-            step = np.array([x, y]) - place
-            toward, square = np.arctan2(step[1], step[0]) - turn, step @ step
-            heard += strength / square * response(toward)
-            down = 2.0 * MOUNT.translation_m[2]  # the image below a floor that absorbs half
-            aperture = np.sqrt(square / (square + down**2))
-            heard += 0.5 * strength / (square + down**2) * response(toward, aperture)
-        power.append(heard * (1.0 + 0.02 * rng.standard_normal((4, 120))))
-        ray = 2.0 * np.pi * np.arange(360) / 360 + turn
-        with np.errstate(divide="ignore"):
-            to_x = np.where(np.cos(ray) > 0, WIDTH - place[0], -place[0]) / np.cos(ray)
-            to_y = np.where(np.sin(ray) > 0, DEPTH - place[1], -place[1]) / np.sin(ray)
-        ranges.append(np.minimum(to_x, to_y))
-    bearing = 2.0 * np.pi * np.arange(120) / 120
-    parts = np.array(power, np.float32)
-    scans = AudioScans(
-        time_ns,
-        bearing,
-        parts.sum(axis=1),
-        LevelReference.FULL_SCALE,
-        sub_bands=parts,
-        sub_band_hz=ScanConfig().sub_band_hz,
-    )
-    array = MicArray(POSITIONS, MOUNT, None)
-    around = np.array(ranges, np.float32)
-    return fitted_sources(scans, around, track, array, ScanConfig(), DetectConfig())
+def run(emitters, **more):
+    return fitted_sources(*observed(emitters, **more), ScanConfig(), DetectConfig())
 
 
 @pytest.fixture(scope="module")

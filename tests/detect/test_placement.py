@@ -28,6 +28,7 @@ def test_a_source_between_is_told_to_be_uncertain():
     found = placed(1.84, odds=2.0)
     assert 1.84 < found.place_m[0] < 2.0
     assert np.sqrt(found.covariance_m2[0, 0]) > 0.06
+    assert 0.2 < found.surface_odds < 5.0
 
 
 def test_without_any_surface_bearings_decide():

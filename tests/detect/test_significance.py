@@ -3,14 +3,19 @@ import dataclasses
 import numpy as np
 import pytest
 
-from soundmap.detect.significance import GHOST_RATE, Marks, false_alarm_probabilities, log_odds
+from soundmap.detect.significance import (
+    GHOST_RATE,
+    PER_STEADINESS,
+    Marks,
+    false_alarm_probabilities,
+    log_odds,
+)
 
 USUAL = Marks(
     gain=np.array([400.0]),
     steadiness=np.array([5.0]),
-    area_m2=np.array([0.05**2]),
+    surface_odds=np.array([10.0]),
     behind_m=np.array([0.0]),
-    on_surface=np.array([True]),
 )
 
 
@@ -19,9 +24,8 @@ USUAL = Marks(
     [
         {"gain": np.array([200.0])},
         {"steadiness": np.array([2.0])},
-        {"area_m2": np.array([0.01])},
         {"behind_m": np.array([0.4])},
-        {"on_surface": np.array([False])},
+        {"surface_odds": np.array([0.1])},
     ],
     ids=lambda marks: next(iter(marks)),
 )
@@ -40,7 +44,7 @@ def test_beside_something_loud_the_same_is_likelier_a_ghost():
 
 def test_even_odds_are_as_probable_as_was_measured():
     score = log_odds(USUAL)
-    even = dataclasses.replace(USUAL, steadiness=USUAL.steadiness * np.exp(-score / 2.0))
+    even = dataclasses.replace(USUAL, steadiness=USUAL.steadiness - score / PER_STEADINESS)
     np.testing.assert_allclose(false_alarm_probabilities(even), GHOST_RATE, rtol=1e-6)
 
 
@@ -48,9 +52,8 @@ def test_probabilities_stay_between_0_and_1():
     extreme = Marks(
         gain=np.array([0.0, 1e-3, 1e9]),
         steadiness=np.array([0.0, 0.0, 1e9]),
-        area_m2=np.array([1.0, 1e-4, 1e-4]),
         behind_m=np.array([2.0, 0.0, 0.0]),
-        on_surface=np.array([False, False, True]),
+        surface_odds=np.array([0.0, 0.0, 1e9]),
     )
     values = false_alarm_probabilities(extreme)
     assert np.all((values >= 0.0) & (values <= 1.0))
