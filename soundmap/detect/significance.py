@@ -82,7 +82,7 @@ def false_alarm_probabilities(marks: Marks) -> FloatArray:
     >>> ghost = Marks(*np.array([[400.0], [4.0], [0.1], [0.1]]))
     >>> source = Marks(*np.array([[400.0], [10.0], [1.0], [0.0]]))
     >>> false_alarm_probabilities(ghost).round(3), false_alarm_probabilities(source).round(4)
-    (array([0.161]), array([0.0001]))
+    (array([0.402]), array([0.0004]))
     """
     exponent = np.clip(-GHOST_DECAY * log_odds(marks), -700.0, 700.0)
     return np.asarray(np.minimum(GHOST_RATE * np.exp(exponent), 1.0))
