@@ -106,7 +106,7 @@ def with_samples(event, samples):
     return with_values(event, data=np.ascontiguousarray(samples, dtype="<i2").tobytes())
 
 
-def expect(losses, what, count, first_s, last_s=None):
+def assert_reported(losses, what, count, first_s, last_s=None):
     """This loss and no other that matters, at this time to within one message."""
     lost = [loss for loss in losses.values() if loss.data_lost and loss.where.startswith("/")]
     assert [loss.what for loss in lost] == [what]
@@ -121,7 +121,7 @@ def expect(losses, what, count, first_s, last_s=None):
 
 def test_a_gap_in_the_audio(site, drive):
     events = changed(drive, "/mics", during(MIDDLE_S, 3.4, lambda event: None))
-    loss = expect(reported(site, events), "gap in the audio", 1, 3.4)
+    loss = assert_reported(reported(site, events), "gap in the audio", 1, 3.4)
     assert loss.effect.startswith("0.40 s")
 
 
@@ -129,7 +129,7 @@ def test_audio_blocks_that_are_repeated(site, drive):
     twice = [event for event in drive if event.topic == "/mics" and 3.0 < seconds(event) <= 3.2]
     events = sorted([*drive, *twice], key=lambda event: event.time_ns)
     what = "audio block repeats or overlaps the one before"
-    expect(reported(site, events), what, 10, 3.02, 3.2)
+    assert_reported(reported(site, events), what, 10, 3.02, 3.2)
 
 
 def test_audio_blocks_that_overlap(site, drive):
@@ -143,7 +143,7 @@ def test_audio_blocks_that_overlap(site, drive):
 
     events = changed(drive, "/mics", during(3.0, 3.2, longer))
     what = "audio block begins before the end of the one before"
-    expect(reported(site, events), what, 10, 3.02, 3.2)
+    assert_reported(reported(site, events), what, 10, 3.02, 3.2)
 
 
 @pytest.mark.parametrize(("topic", "sensor"), [("/scan", "laser"), ("/odom", "odometry")])
@@ -152,7 +152,7 @@ def test_stamps_that_run_backwards(site, drive, topic, sensor):
     events = changed(drive, topic, during(3.0, 3.1, lambda e: stamped(e, stamp_of(e) - back)))
     count = sum(event.topic == topic and 3.0 < seconds(event) <= 3.1 for event in drive)
     what = f"{sensor} stamp runs backward or repeats"
-    expect(reported(site, events), what, count, 3.02 if topic == "/odom" else 3.05, 3.1)
+    assert_reported(reported(site, events), what, count, 3.02 if topic == "/odom" else 3.05, 3.1)
 
 
 @pytest.mark.parametrize("topic", ["/mics", "/scan", "/odom"])
@@ -160,7 +160,7 @@ def test_stamps_that_run_backwards(site, drive, topic, sensor):
 def test_a_clock_that_is_set_on_the_way(site, drive, topic, step_s):
     step_ns = int(step_s * SECOND)
     events = changed(drive, topic, during(3.0, 9.0, lambda e: stamped(e, stamp_of(e) + step_ns)))
-    loss = expect(reported(site, events), "clock of the stamps was set", 1, 3.02)
+    loss = assert_reported(reported(site, events), "clock of the stamps was set", 1, 3.02)
     assert loss.where == topic
 
 
@@ -197,7 +197,9 @@ def test_a_microphone_that_dies_on_the_way(site, drive):
         return with_samples(event, samples)
 
     events = changed(drive, "/mics", during(3.0, 9.0, dies))
-    loss = expect(reported(site, events), "microphone is dead", 1, 3.02, seconds(drive[-1]))
+    loss = assert_reported(
+        reported(site, events), "microphone is dead", 1, 3.02, seconds(drive[-1])
+    )
     assert loss.effect.startswith("channel 4 ")
 
 
@@ -243,7 +245,7 @@ def test_float_audio_with_samples_that_are_no_numbers(site, drive):
         return with_values(event, format="float", data=samples.tobytes())
 
     losses = reported(site, changed(drive, "/mics", as_float))
-    expect(losses, "audio sample is not a number", 5 * 11, 3.02, 3.1)
+    assert_reported(losses, "audio sample is not a number", 5 * 11, 3.02, 3.1)
 
 
 def test_without_any_sound_there_is_nothing_to_use(site, drive):
@@ -262,7 +264,7 @@ def test_laser_scans_without_a_return(site, drive):
         return with_values(event, ranges=np.full(361, np.inf))
 
     events = changed(drive, "/scan", during(3.0, 3.4, blind))
-    expect(reported(site, events), "laser scan without a single return", 8, 3.02, 3.4)
+    assert_reported(reported(site, events), "laser scan without a single return", 8, 3.02, 3.4)
 
 
 @pytest.mark.parametrize("beams", [200, 500])
@@ -272,7 +274,7 @@ def test_laser_scans_with_too_few_or_too_many_ranges(site, drive, beams):
 
     events = changed(drive, "/scan", during(3.0, 3.4, other))
     what = "laser scan with more or fewer ranges than its angles tell"
-    expect(reported(site, events), what, 8, 3.02, 3.4)
+    assert_reported(reported(site, events), what, 8, 3.02, 3.4)
 
 
 def test_laser_scans_without_an_angle_between_rays(site, drive):
@@ -280,12 +282,12 @@ def test_laser_scans_without_an_angle_between_rays(site, drive):
         return with_values(event, angle_increment=0.0, angle_max=event.values["angle_min"])
 
     events = changed(drive, "/scan", during(3.0, 3.4, still))
-    expect(reported(site, events), "damaged laser message", 8, 3.02, 3.4)
+    assert_reported(reported(site, events), "damaged laser message", 8, 3.02, 3.4)
 
 
 def test_laser_angles_that_are_no_numbers(site, drive):
     events = changed(drive, "/scan", during(3.0, 3.4, lambda e: with_values(e, angle_min=np.nan)))
-    expect(reported(site, events), "damaged laser message", 8, 3.02, 3.4)
+    assert_reported(reported(site, events), "damaged laser message", 8, 3.02, 3.4)
 
 
 def test_laser_ranges_that_are_no_numbers_are_no_returns(site, drive):
@@ -299,13 +301,13 @@ def test_laser_ranges_that_are_no_numbers_are_no_returns(site, drive):
 
 def test_a_laser_that_ends_early(site, drive):
     events = changed(drive, "/scan", during(5.0, 9.0, lambda event: None))
-    loss = expect(reported(site, events), "ends before the other sensors do", 1, 5.0)
+    loss = assert_reported(reported(site, events), "ends before the other sensors do", 1, 5.0)
     assert loss.where == "/scan"
 
 
 def test_a_laser_that_is_silent_for_a_while(site, drive):
     events = changed(drive, "/scan", during(2.0, 3.0, lambda event: None))
-    loss = expect(reported(site, events), "sensor silent for a while", 1, 2.0)
+    loss = assert_reported(reported(site, events), "sensor silent for a while", 1, 2.0)
     assert loss.effect.startswith(("1.0 s", "1.1 s"))
 
 
@@ -321,17 +323,17 @@ def moved(event, x, y):
 
 def test_odometry_that_jumps(site, drive):
     events = changed(drive, "/odom", during(3.0, 9.0, lambda event: moved(event, 5.0, -2.0)))
-    expect(reported(site, events), "odometry jumps", 1, 3.02)
+    assert_reported(reported(site, events), "odometry jumps", 1, 3.02)
 
 
 def test_odometry_that_is_off_for_one_message(site, drive):
     events = changed(drive, "/odom", during(3.0, 3.02, lambda event: moved(event, 0.0, 8.0)))
-    expect(reported(site, events), "odometry jumps", 2, 3.02, 3.04)
+    assert_reported(reported(site, events), "odometry jumps", 2, 3.02, 3.04)
 
 
 def test_odometry_that_ends_early(site, drive):
     events = changed(drive, "/odom", during(5.0, 9.0, lambda event: None))
-    loss = expect(reported(site, events), "ends before the other sensors do", 1, 5.0)
+    loss = assert_reported(reported(site, events), "ends before the other sensors do", 1, 5.0)
     assert loss.where == "/odom"
 
 
