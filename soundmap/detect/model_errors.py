@@ -67,12 +67,17 @@ class Precision:
             ]
             return
         self.inverse = [np.empty((len(evidence), size, size), dtype=np.float32) for size in sizes]
+        bands = [slice(start, stop) for start, stop in pairwise(starts)]
 
         def invert(scans: slice) -> None:
-            modes = [mode for each in components for mode in _modes(evidence, each, scans)]
-            for band, inverse in enumerate(self.inverse):
-                own = slice(starts[band], starts[band + 1])
-                inverse[scans] = _inverse([mode[:, own] for mode in modes], inverse.shape[1])
+            loud: list[list[Single]] = [[] for _ in self.inverse]  # what is quiet goes at once
+            for mode in (mode for each in components for mode in _modes(evidence, each, scans)):
+                for kept, own in zip(loud, bands, strict=True):
+                    if _is_loud(mode[:, own]):
+                        kept.append(mode[:, own].copy())
+            for kept, inverse in zip(loud, self.inverse, strict=True):
+                inverse[scans] = _inverse(kept, inverse.shape[1])
+                kept.clear()
 
         side_by_side(invert, parts(len(evidence)))
 
@@ -97,12 +102,15 @@ def parts(scans: int) -> list[slice]:
     return [slice(i, min(i + SCANS_AT_ONCE, scans)) for i in range(0, scans, SCANS_AT_ONCE)]
 
 
+def _is_loud(mode: Single) -> bool:
+    return bool(np.einsum("sd,sd->s", mode, mode).max() > LEAST_MODE)
+
+
 def _inverse(modes: list[Single], size: int) -> Single:
     """Inverse of the identity plus the squares of all modes, each (S, d)."""
-    loud = [mode for mode in modes if np.einsum("sd,sd->s", mode, mode).max() > LEAST_MODE]
-    if not loud:
+    if not modes:
         return np.eye(size, dtype=np.float32)[None]
-    stacked = np.stack(loud, axis=1)
+    stacked = np.stack(modes, axis=1)
     covariance = np.matmul(stacked.transpose(0, 2, 1), stacked)
     covariance[:, np.arange(size), np.arange(size)] += 1.0
     return np.asarray(np.linalg.inv(covariance), dtype=np.float32)
