@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 
 from soundmap.calibrate.calibration import array_offsets
 from soundmap.config import Config, ScanConfig
+from soundmap.detect.evidence import ranged_scans
 from soundmap.detect.fitted_sources import fitted_sources
 from soundmap.detect.place_levels import with_level_errors
 from soundmap.detect.source_list import detect_sources
 from soundmap.errors import ConfigError, NothingUsableError
 from soundmap.fuse.accumulate import PowerAccumulator
 from soundmap.fuse.bearing_range import ranges_around
-from soundmap.fuse.fitted_map import fitted_power_map
+from soundmap.fuse.fitted_map import fitted_power_map, mapped_scans
 from soundmap.fuse.power_map import fused_scans, level_reference, power_map_frame
 from soundmap.fuse.surroundings import SurroundingsGatherer
 from soundmap.geometry import Trajectory
@@ -91,15 +92,15 @@ def process(
     room, trajectory, losses = measured.room, measured.trajectory, LossLedger()
     with clock.stage("calibrate"):
         measured, offsets = _calibrated(measured, config)
-    scans, array = measured.scans, measured.array
+    scans = measured.scans
     if heard is not None:
         heard(scans, trajectory)
     with clock.stage("fuse"):
         power_map, fused = _fused(measured, config, losses)
-        around = ranges_around(measured.surroundings, trajectory, scans.time_ns, array.mount)
+        around = _around(measured, config) if config.detect.method == "sparse" else None
         measured = replace(measured, surroundings=NO_SURROUNDINGS)
     with clock.stage("detect"):
-        if config.detect.method == "sparse":
+        if around is not None:
             sources, power_map = _fitted(measured, around, power_map.frame, config, losses)
         else:
             sources = detect_sources(power_map, config.detect)
@@ -157,6 +158,15 @@ def _fused(measured: Measured, config: Config, losses: LossLedger) -> tuple[Powe
     )
     count = sum(scan.point_m is not None for scan in fused)
     return accumulator.power_map(), count
+
+
+def _around(measured: Measured, config: Config) -> NDArray[np.float32]:
+    """Laser ranges around the array at those scans that the fit and its map look at."""
+    scans, trajectory, array = measured.scans, measured.trajectory, measured.array
+    wanted = np.union1d(
+        ranged_scans(scans, trajectory, array, config.scan), mapped_scans(scans, trajectory)
+    )
+    return ranges_around(measured.surroundings, trajectory, scans.time_ns, array.mount, wanted)
 
 
 def _fitted(

@@ -113,16 +113,85 @@ def gathered_evidence(
     ----------
     scans : AudioScans
     range_m : ndarray of float32, shape (S, M)
-        Laser ranges around the array at each scan, on its bearings 2 pi m / M [m].
+        Laser ranges around the array at each scan, on its bearings 2 pi m / M [m]; only those of
+        `ranged_scans` are looked at.
     trajectory : Trajectory
     array : MicArray
     config : ScanConfig
     """
     from scipy.ndimage import uniform_filter1d
 
-    parts, edges_hz = scans.sub_bands, scans.sub_band_hz
-    if parts is None:
-        parts, edges_hz = scans.power[:, None], (config.low_hz, config.high_hz)
+    parts, edges_hz = _sub_bands(scans, config)
+    stands = _stands(scans, trajectory, array, config)
+    chosen, place, axis, group = stands.scan, stands.place_m, stands.axis_rad, stands.group
+    first, count = _firsts(group)
+    table = beam_table(
+        array,
+        edges_hz,
+        bearings=scans.power.shape[1],
+        waves=range_m.shape[1],
+        speed_of_sound_m_s=config.speed_of_sound_m_s,
+    )
+    heard = np.zeros((len(count), table.beams.shape[2]))
+    mean = np.empty((len(chosen), parts.shape[1]))
+    for start in range(0, len(chosen), SCANS_AT_ONCE):
+        block = slice(start, start + SCANS_AT_ONCE)
+        some = parts[chosen[block]]
+        mean[block] = some.mean(axis=2, dtype=np.float64)
+        np.add.at(heard, group[block], table.harmonics(some))
+    heard /= count[:, None]
+    weight = np.sqrt(np.minimum(count, LARGEST_WEIGHT))[:, None]
+    loudness = uniform_filter1d(_means(mean, group, count), LOUDNESS_SCANS, axis=0, mode="nearest")
+    weight = weight / (RELATIVE_NOISE * loudness)
+    return Evidence(
+        _means(place, group, count),
+        axis[first] + _means(wrapped_angle(axis - axis[first][group]), group, count),
+        array.mount.handedness,
+        float(array.mount.translation_m[2]),
+        np.minimum(stands.turn_rad[first], MOST_TURN_RAD),
+        count,
+        range_m[chosen[first]],
+        (heard * weight[:, table.part]).astype(np.float32),
+        weight,
+        table,
+    )
+
+
+def ranged_scans(
+    scans: AudioScans, trajectory: Trajectory, array: MicArray, config: ScanConfig
+) -> NDArray[np.int64]:
+    """Which scans `gathered_evidence` needs laser ranges of: of a long run, by far not all."""
+    stands = _stands(scans, trajectory, array, config)
+    return stands.scan[_firsts(stands.group)[0]]
+
+
+@dataclass(frozen=True)
+class _Stands:
+    """The T scans to be used: index, pose of the array, turn during the scan, and group.
+
+    Scans of a group were taken from one pose.
+    """
+
+    scan: NDArray[np.int64]
+    place_m: FloatArray
+    axis_rad: FloatArray
+    turn_rad: FloatArray
+    group: NDArray[np.int64]
+
+
+def _sub_bands(
+    scans: AudioScans, config: ScanConfig
+) -> tuple[NDArray[np.float32], tuple[float, ...]]:
+    """Power of each part of the band, shape (S, B, N), and the edges of the parts [Hz]."""
+    if scans.sub_bands is None:
+        return scans.power[:, None], (config.low_hz, config.high_hz)
+    return scans.sub_bands, scans.sub_band_hz
+
+
+def _stands(
+    scans: AudioScans, trajectory: Trajectory, array: MicArray, config: ScanConfig
+) -> _Stands:
+    parts, _ = _sub_bands(scans, config)
     half_ns = round(0.5 * (config.frames - 1) * config.hop_s * 1e9)
     offsets = np.linspace(-half_ns, half_ns, max(config.frames, 2)).astype(np.int64)
     poses = trajectory.at(scans.time_ns[:, None] + offsets)
@@ -143,35 +212,7 @@ def gathered_evidence(
         kept = _seldom_seen(place, axis, group)
         chosen, place, axis, turn = chosen[kept], place[kept], axis[kept], turn[kept]
         group = np.unique(group[kept], return_inverse=True)[1].astype(np.int64)
-    first, count = _firsts(group)
-    mean = parts[chosen].mean(axis=2, dtype=np.float64)
-    table = beam_table(
-        array,
-        edges_hz,
-        bearings=scans.power.shape[1],
-        waves=range_m.shape[1],
-        speed_of_sound_m_s=config.speed_of_sound_m_s,
-    )
-    heard = np.zeros((len(count), table.beams.shape[2]))
-    for start in range(0, len(chosen), SCANS_AT_ONCE):
-        block = slice(start, start + SCANS_AT_ONCE)
-        np.add.at(heard, group[block], table.harmonics(parts[chosen[block]]))
-    heard /= count[:, None]
-    weight = np.sqrt(np.minimum(count, LARGEST_WEIGHT))[:, None]
-    loudness = uniform_filter1d(_means(mean, group, count), LOUDNESS_SCANS, axis=0, mode="nearest")
-    weight = weight / (RELATIVE_NOISE * loudness)
-    return Evidence(
-        _means(place, group, count),
-        axis[first] + _means(wrapped_angle(axis - axis[first][group]), group, count),
-        mount.handedness,
-        float(mount.translation_m[2]),
-        np.minimum(turn[first], MOST_TURN_RAD),
-        count,
-        range_m[chosen][first],
-        (heard * weight[:, table.part]).astype(np.float32),
-        weight,
-        table,
-    )
+    return _Stands(chosen, place, axis, turn, group)
 
 
 def _rests(place_m: FloatArray, axis_rad: FloatArray) -> NDArray[np.int64]:

@@ -16,6 +16,8 @@ CHUNK = 256
 """Times that are worked out at once; bounds the memory of long runs."""
 AROUND = 360
 """Directions in which :func:`ranges_around` tells ranges."""
+ROWS = 16 * CHUNK
+"""Times of which it holds the ranges twice."""
 
 
 def surface_ranges(
@@ -70,16 +72,26 @@ def surface_ranges(
 
 
 def ranges_around(
-    surroundings: Surroundings, trajectory: Trajectory, time_ns: NDArray[np.int64], mount: Mount
+    surroundings: Surroundings,
+    trajectory: Trajectory,
+    time_ns: NDArray[np.int64],
+    mount: Mount,
+    wanted: NDArray[np.int64] | None = None,
 ) -> NDArray[np.float32]:
     """Ranges to the first surface all around the array at many times, shape (S, M) [m].
 
-    On its own bearings 2 pi m / M; NaN where unknown.
+    On its own bearings 2 pi m / M; NaN where unknown. If only some times are wanted, the others
+    have 0 and take no memory.
     """
+    some = np.arange(len(time_ns)) if wanted is None else wanted
     directions = 2.0 * np.pi * np.arange(AROUND) / AROUND
-    return surface_ranges(
-        surroundings, trajectory, time_ns, mount, directions, tolerance_rad=np.pi / AROUND
-    )
+    ranges = np.zeros((len(time_ns), AROUND), dtype=np.float32)  # pages come as they are filled
+    for start in range(0, len(some), ROWS):
+        rows = some[start : start + ROWS]
+        ranges[rows] = surface_ranges(
+            surroundings, trajectory, time_ns[rows], mount, directions, tolerance_rad=np.pi / AROUND
+        )
+    return ranges
 
 
 def ranges_on_bearings(

@@ -59,7 +59,8 @@ def fitted_power_map(
         Of a fit.
     scans : AudioScans
     around : ndarray, shape (S, M)
-        Ranges to the first surface at each scan, on the array's bearings 2 pi m / M [m].
+        Ranges to the first surface at each scan, on the array's bearings 2 pi m / M [m]; only those
+        of `mapped_scans` are looked at.
     trajectory : Trajectory
     array : MicArray
     frame : GridFrame
@@ -73,8 +74,7 @@ def fitted_power_map(
     PowerMap
         Powers are mean squares at 1 m [linear]; a visit is a scan that tells of the cell.
     """
-    use = np.flatnonzero(trajectory.usable_at(scans.time_ns) & np.isfinite(scans.power).all(axis=1))
-    use = use[np.linspace(0, len(use) - 1, min(MOST_SCANS, len(use))).astype(np.int64)]
+    use = mapped_scans(scans, trajectory)
     power, pose = scans.power[use].astype(np.float64), trajectory.at(scans.time_ns[use])
     bearing = 2.0 * np.pi * np.arange(power.shape[1]) / power.shape[1]
     ranges = _on_bearings(around[use], bearing)
@@ -87,6 +87,12 @@ def fitted_power_map(
     size = 2.0 * np.pi / len(bearing) * ranges[seen]
     limits = _Limits(frame, point, rest[seen] * ranges[seen] ** 2, size)
     return _with_sources(limits, frame, sources)
+
+
+def mapped_scans(scans: AudioScans, trajectory: Trajectory) -> NDArray[np.int64]:
+    """Which scans make the map."""
+    use = np.flatnonzero(trajectory.usable_at(scans.time_ns) & np.isfinite(scans.power).all(axis=1))
+    return use[np.linspace(0, len(use) - 1, min(MOST_SCANS, len(use))).astype(np.int64)]
 
 
 def _on_bearings(around: NDArray[np.float32], bearing_rad: FloatArray) -> FloatArray:

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from soundmap.config import ArrayConfig, ScanConfig
-from soundmap.detect.evidence import LONG_RUN_SCANS, gathered_evidence
+from soundmap.detect.evidence import LONG_RUN_SCANS, gathered_evidence, ranged_scans
 from soundmap.geometry import Mount, Trajectory
 from soundmap.sensors import MicArray
 from soundmap.sound import AudioScans, LevelReference
@@ -10,8 +10,8 @@ from soundmap.sound import AudioScans, LevelReference
 ARRAY = MicArray(ArrayConfig().microphone_positions(), Mount.planar(0.1, 0.0, 0.5, 0.3), None)
 
 
-def laps(count, *, radius_m=4.0, scans=500):
-    """Evidence of laps on a circle, 5 cm from scan to scan; each scan is as loud as its number."""
+def driven_laps(count, *, radius_m=4.0, scans=500):
+    """Laps on a circle, 5 cm from scan to scan; each scan is as loud as its number."""
     rng = np.random.default_rng(1)
     number = np.arange(count * scans)
     time_ns = 10**18 + number * 100_000_000
@@ -27,7 +27,12 @@ def laps(count, *, radius_m=4.0, scans=500):
         LevelReference.FULL_SCALE,
         ARRAY.mount,
     )
-    ranges = np.full((len(number), 360), 2.0, dtype=np.float32)
+    return kept, trajectory
+
+
+def laps(count):
+    kept, trajectory = driven_laps(count)
+    ranges = np.full((len(kept), 360), 2.0, dtype=np.float32)
     return gathered_evidence(kept, ranges, trajectory, ARRAY, ScanConfig())
 
 
@@ -47,3 +52,13 @@ def test_of_a_long_run_as_much_is_used_as_of_a_short_one_from_everywhere_at_all_
     when = 1.0 / evidence.weight[:, 0] / (1.0 / evidence.weight[:, 0]).max()
     used = np.histogram(when, np.linspace(0.0, 1.0, count + 1))[0]
     assert used.min() > 0.2 * used.max()
+
+
+@pytest.mark.parametrize("count", [1, 12])
+def test_ranges_are_needed_of_just_those_scans_that_are_told(count):
+    kept, trajectory = driven_laps(count)
+    needed = ranged_scans(kept, trajectory, ARRAY, ScanConfig())
+    ranges = np.full((len(kept), 360), np.nan, dtype=np.float32)
+    ranges[needed] = needed[:, None]
+    evidence = gathered_evidence(kept, ranges, trajectory, ARRAY, ScanConfig())
+    assert evidence.range_m[:, 0].tolist() == needed.tolist()

@@ -89,3 +89,13 @@ def test_ranges_are_unknown_where_no_surroundings_or_motion_are():
     ranges = ranges_around(surroundings, track, time_ns, MOUNTS["turned"])
     assert np.isfinite(ranges).any(axis=1).tolist() == [True, False, False]
     assert np.isnan(ranges_around(NO_SURROUNDINGS, track, time_ns, MOUNTS["turned"])).all()
+
+
+def test_ranges_at_some_times_are_those_among_all():
+    track, surroundings = driving(np.random.default_rng(4))
+    time_ns = np.linspace(track.time_ns[0], track.time_ns[-1], 40).astype(np.int64)
+    every = ranges_around(surroundings, track, time_ns, MOUNTS["turned"])
+    wanted = np.array([0, 3, 20, 39])
+    some = ranges_around(surroundings, track, time_ns, MOUNTS["turned"], wanted)
+    assert some.shape == every.shape
+    assert np.array_equal(some[wanted], every[wanted], equal_nan=True)

@@ -7,7 +7,7 @@ import pytest
 from heard import circle, drive, heard_scans
 
 from soundmap.config import FuseConfig, ScanConfig
-from soundmap.fuse.fitted_map import fitted_power_map
+from soundmap.fuse.fitted_map import fitted_power_map, mapped_scans
 from soundmap.grid import GridFrame
 from soundmap.sensors import MicArray
 from soundmap.sound import LevelReference, Source, SourceFit, SourceList, decibels
@@ -115,3 +115,14 @@ def test_silence_and_unknown_ranges_leave_no_warning_and_nothing_but_the_truth()
     assert not blind.visits.any()
     outside = mapped([source((40.0, 40.0))])
     assert outside.is_limit.all()
+
+
+def test_only_the_scans_of_the_map_need_ranges(monkeypatch):
+    monkeypatch.setattr("soundmap.fuse.fitted_map.MOST_SCANS", 40)
+    needed = mapped_scans(SCANS, TRUTH)
+    assert len(needed) == 40
+    others = np.setdiff1d(np.arange(len(SCANS)), needed)
+    around = ranges()
+    around[others] = np.nan
+    whole, part = mapped([source()]), mapped([source()], around=around)
+    assert np.array_equal(whole.power_sum, part.power_sum)
