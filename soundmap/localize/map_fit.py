@@ -9,6 +9,7 @@ surfaces and is weighed down by a robust kernel.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -83,10 +84,11 @@ def point_pull(
     pose: FloatArray,
     points_m: NDArray[np.floating],
     first: NDArray[np.int64],
-    share: FloatArray,
+    share: NDArray[Any],
     *,
     sigma_m: float,
     kernel_m: float,
+    whole: float = 1.0,
 ) -> tuple[FloatArray, FloatArray]:
     r"""Normal equations of fitting the points of each pose to the map.
 
@@ -105,11 +107,13 @@ def point_pull(
     first : ndarray of int64, shape (K + 1,)
         Points of pose k are ``points_m[first[k]:first[k + 1]]``.
     share : ndarray, shape (P,)
-        Weight of each point.
+        Weight of each point, in parts of ``whole``; what has none does not count.
     sigma_m : float
         :math:`\sigma` [m].
     kernel_m : float
         :math:`c` [m]; points farther off than 3 c do not count at all.
+    whole : float, optional
+        The share of a point of full weight: small integers keep a long run's shares small.
 
     Returns
     -------
@@ -124,6 +128,7 @@ def point_pull(
         np.ascontiguousarray(points_m, dtype=np.float32),
         first,
         share,
+        whole,
         sigma_m,
         kernel_m,
     )
@@ -183,14 +188,24 @@ def _point_pull(
     pose: FloatArray,
     points: NDArray[np.float32],
     first: NDArray[np.int64],
-    share: FloatArray,
+    share: NDArray[Any],
+    whole: float,
     sigma: float,
     kernel: float,
 ) -> tuple[FloatArray, FloatArray]:
     information = np.zeros((len(pose), 3, 3))
     pull = np.zeros((len(pose), 3))
+    most = 0
     for k in range(len(pose)):
-        own = slice(first[k], first[k + 1])
+        most = max(most, first[k + 1] - first[k])
+    own, weight = np.empty((most, 2), dtype=np.float32), np.empty(most)
+    for k in range(len(pose)):
+        count = 0
+        for i in range(first[k], first[k + 1]):
+            if share[i] > 0:
+                own[count, 0], own[count, 1] = points[i, 0], points[i, 1]
+                weight[count] = share[i] / whole
+                count += 1
         add_map_pull(
             information[k],
             pull[k],
@@ -200,8 +215,8 @@ def _point_pull(
             corner,
             resolution,
             pose[k],
-            points[own],
-            share[own],
+            own[:count],
+            weight[:count],
             sigma,
             kernel,
         )

@@ -20,8 +20,8 @@ KERNEL_M = 0.15
 """Width of the robust kernel of the points that the map explains [m]."""
 VIEWS_AT_ONCE = 1024
 """Views whose returns are placed at once; bounds the memory of long runs."""
-MAP_SHARE = 0.1
-"""Weight that the map's own cells keep where the run's returns draw a line in them."""
+WHOLE, MAP_SHARE = 10, 1
+"""Weight that the map's own cells keep where the run's returns draw a line in them: a tenth."""
 
 
 class WallFit:
@@ -50,26 +50,40 @@ class WallFit:
         by_lines : bool
             Fit to lines as well as to cells.
         """
-        points_m = views.end_m[counts]
-        first = np.concatenate([[0], np.cumsum(counts)])[views.first].astype(np.int64)
+        points_m, first = views.end_m, views.first  # as they are: a long run has many
         sigma_m, weight = self._sigma_m, self._independence
-        share = np.ones(len(points_m))
+        share = np.where(counts, np.uint8(WHOLE), np.uint8(0))
 
         def by_map(at: FloatArray) -> tuple[FloatArray, FloatArray]:
             information, pull = point_pull(
-                self._surface, at, points_m, first, share, sigma_m=sigma_m, kernel_m=KERNEL_M
+                self._surface,
+                at,
+                points_m,
+                first,
+                share,
+                sigma_m=sigma_m,
+                kernel_m=KERNEL_M,
+                whole=WHOLE,
             )
             return weight * information, weight * pull
 
         if not by_lines:
             return lambda at: _borne_out(*by_map(at))
-        lines = wall_lines(self._surface, (part for _, part in _placed(pose, points_m, first)))
-        for own, part in _placed(pose, points_m, first):
-            share[own][has_line(self._surface, lines, part)] = MAP_SHARE
+        placed = (part for _, part in _placed(pose, points_m, first, counts))
+        lines = wall_lines(self._surface, placed)
+        for own, part in _placed(pose, points_m, first, counts):
+            share[own[has_line(self._surface, lines, part)]] = MAP_SHARE
 
         def by_both(at: FloatArray) -> tuple[FloatArray, FloatArray]:
             information, pull = line_pull(
-                self._surface, lines, at, points_m, first, sigma_m=sigma_m, kernel_m=KERNEL_M
+                self._surface,
+                lines,
+                at,
+                points_m,
+                first,
+                counts,
+                sigma_m=sigma_m,
+                kernel_m=KERNEL_M,
             )
             map_information, map_pull = by_map(at)
             return _borne_out(weight * information + map_information, weight * pull + map_pull)
@@ -83,11 +97,15 @@ def _borne_out(information: FloatArray, pull: FloatArray) -> tuple[FloatArray, F
 
 
 def _placed(
-    pose: FloatArray, points_m: NDArray[np.float32], first: NDArray[np.int64]
-) -> Iterator[tuple[slice, FloatArray]]:
-    """The returns of some views at a time in the map frame, and which they are."""
+    pose: FloatArray,
+    points_m: NDArray[np.float32],
+    first: NDArray[np.int64],
+    counts: NDArray[np.bool_],
+) -> Iterator[tuple[NDArray[np.int64], FloatArray]]:
+    """The returns that count of some views at a time in the map frame, and which they are."""
     for start in range(0, len(pose), VIEWS_AT_ONCE):
         ends = first[start : start + VIEWS_AT_ONCE + 1]
-        own = slice(int(ends[0]), int(ends[-1]))
-        at = np.repeat(pose[start : start + VIEWS_AT_ONCE], np.diff(ends), axis=0)
-        yield own, transformed(at, points_m[own])
+        own = np.flatnonzero(counts[ends[0] : ends[-1]])
+        view = np.repeat(np.arange(start, start + len(ends) - 1), np.diff(ends))[own]
+        own += ends[0]
+        yield own, transformed(pose[view], points_m[own])

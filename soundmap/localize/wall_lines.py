@@ -105,6 +105,7 @@ def line_pull(
     pose: FloatArray,
     points_m: NDArray[np.floating],
     first: NDArray[np.int64],
+    counts: NDArray[np.bool_],
     *,
     sigma_m: float,
     kernel_m: float,
@@ -112,7 +113,7 @@ def line_pull(
     """Normal equations of fitting the points of each pose to the lines nearest to them.
 
     Parameters and results are those of `soundmap.localize.map_fit.point_pull`; points without a
-    line nearby do not count.
+    line nearby do not count, nor do those that ``counts``, shape (P,), leaves out.
     """
     return _line_pull(
         surface.nearest,
@@ -123,6 +124,7 @@ def line_pull(
         np.ascontiguousarray(pose),
         np.ascontiguousarray(points_m, dtype=np.float32),
         first,
+        counts,
         sigma_m,
         kernel_m,
     )
@@ -182,6 +184,7 @@ def _line_pull(
     pose: FloatArray,
     points: NDArray[np.float32],
     first: NDArray[np.int64],
+    counts: NDArray[np.bool_],
     sigma: float,
     kernel: float,
 ) -> tuple[FloatArray, FloatArray]:
@@ -191,6 +194,8 @@ def _line_pull(
     for k in range(len(pose)):
         cos, sin = np.cos(pose[k, 2]), np.sin(pose[k, 2])
         for i in range(first[k], first[k + 1]):
+            if not counts[i]:
+                continue
             lever_x = cos * points[i, 0] - sin * points[i, 1]
             lever_y = sin * points[i, 0] + cos * points[i, 1]
             x, y = pose[k, 0] + lever_x, pose[k, 1] + lever_y

@@ -108,7 +108,8 @@ def test_poses_fitted_to_lines_agree_to_millimetres():
     lines = wall_lines(surface, [transformed(np.repeat(POSES, np.diff(FIRST), axis=0), FLAT)])
 
     def by_lines(pose):
-        return line_pull(surface, lines, pose, FLAT, FIRST, sigma_m=0.05, kernel_m=0.15)
+        every = np.ones(len(FLAT), dtype=bool)
+        return line_pull(surface, lines, pose, FLAT, FIRST, every, sigma_m=0.05, kernel_m=0.15)
 
     rng = np.random.default_rng(2)
     off = settled(POSES + rng.normal(size=POSES.shape) * [0.03, 0.03, 0.01], by_lines) - POSES
@@ -152,3 +153,21 @@ def test_points_far_from_every_wall_do_not_pull():
     )
     assert not information.any()
     assert not pull.any()
+
+
+def test_points_that_do_not_count_are_as_if_they_were_not_there():
+    surface, keep = map_surface(ROOM), np.random.default_rng(6).random(len(FLAT)) < 0.6
+    first = np.concatenate([[0], np.cumsum(keep)])[FIRST]
+    tenths = np.where(keep, np.uint8(1), np.uint8(0))
+    kernel = {"sigma_m": 0.05, "kernel_m": 0.15}
+    some = point_pull(surface, POSES, FLAT, FIRST, tenths, whole=10, **kernel)
+    alone = point_pull(surface, POSES, FLAT[keep], first, np.full(keep.sum(), 0.1), **kernel)
+    assert np.array_equal(some[0], alone[0])
+    assert np.array_equal(some[1], alone[1])
+    lines = wall_lines(surface, [transformed(np.repeat(POSES, np.diff(FIRST), axis=0), FLAT)])
+    some = line_pull(surface, lines, POSES, FLAT, FIRST, keep, **kernel)
+    alone = line_pull(
+        surface, lines, POSES, FLAT[keep], first, np.ones(keep.sum(), dtype=bool), **kernel
+    )
+    assert np.array_equal(some[0], alone[0])
+    assert np.array_equal(some[1], alone[1])
