@@ -40,7 +40,7 @@ from soundmap.outputs.progress import Progress, Stage
 from soundmap.run import Run
 from soundmap.scan.audio_scan import audio_scans, kept_scans
 from soundmap.scan.spectrum import band_bins
-from soundmap.sensors import ArrayOffsets, AudioBlock, LaserScan
+from soundmap.sensors import ArrayOffsets, AudioBlock, LaserScan, MicArray
 from soundmap.sound import AudioScans, PowerMap, SourceList
 from soundmap.surroundings import NO_SURROUNDINGS
 
@@ -229,25 +229,50 @@ def _measured(
     """One pass over the log: audio scans and surroundings; and the trajectory in the map."""
     with clock.stage("read"):
         log = open_log(log_path, config)
-    with log.losses.told_with_errors():
-        return _measured_of(log, given, config, start_pose, clock)
+    losses, odometry = log.losses, log.odometry
+    with losses.told_with_errors():
+        if log.array is None:
+            raise ValueError("the log was opened without audio")
+        array, scanners = log.array, len(log.scanners)
+        fingerprint, duration_s = log.fingerprint, log.duration_s
+        _check_band(log, config.scan)
+        built = _built_map(log, config, clock) if given is None else None
+        gatherer = SurroundingsGatherer(odometry)
+        chooser = ViewChooser(odometry, config.localize, losses)
+        watchers = [gatherer.see] if built is not None else [gatherer.see, chooser.see]
+        scans = _heard(log, array, watchers, config, clock)
+        del log  # with the times of all its messages
+        surroundings = gatherer.gathered()
+        if built is not None:
+            room, trajectory = built.room, built.trajectory
+        elif given is not None:
+            with clock.stage("localize"):
+                room, views = given, chooser.views()
+                trajectory = localized(
+                    views, odometry, room, config.localize, start_pose=start_pose, losses=losses
+                )
+    return Measured(
+        room=room,
+        trajectory=trajectory,
+        scans=scans,
+        surroundings=surroundings,
+        array=array,
+        losses=tuple(losses),
+        scanners=scanners,
+        odometry_poses=len(odometry),
+        fingerprint=fingerprint,
+        duration_s=duration_s,
+    )
 
 
-def _measured_of(
+def _heard(
     log: RobotLog,
-    given: OccupancyGrid | None,
+    array: MicArray,
+    watchers: Sequence[Callable[[LaserScan], None]],
     config: Config,
-    start_pose: tuple[float, float, float] | None,
     clock: _Stopwatch,
-) -> Measured:
-    array = log.array
-    if array is None:
-        raise ValueError("the log was opened without audio")
-    _check_band(log, config.scan)
-    built = _built_map(log, config, clock) if given is None else None
-    gatherer = SurroundingsGatherer(log.odometry)
-    chooser = ViewChooser(log.odometry, config.localize, log.losses)
-    watchers = [gatherer.see] if built is not None else [gatherer.see, chooser.see]
+) -> AudioScans:
+    """All audio scans of the log, whose laser scans are shown to the watchers."""
     with clock.stage("scan", log.duration_s) as stage:
         blocks = _audio_of(_watched(log, stage), watchers)
         scans = kept_scans(
@@ -268,32 +293,7 @@ def _measured_of(
             f"{log.path}: the audio is too short or too broken for one audio scan of "
             f"{config.scan.frames} windows."
         )
-    surroundings = gatherer.gathered()
-    if built is not None:
-        room, trajectory = built.room, built.trajectory
-    elif given is not None:
-        with clock.stage("localize"):
-            room, views = given, chooser.views()
-            trajectory = localized(
-                views,
-                log.odometry,
-                room,
-                config.localize,
-                start_pose=start_pose,
-                losses=log.losses,
-            )
-    return Measured(
-        room=room,
-        trajectory=trajectory,
-        scans=scans,
-        surroundings=surroundings,
-        array=array,
-        losses=tuple(log.losses),
-        scanners=len(log.scanners),
-        odometry_poses=len(log.odometry),
-        fingerprint=log.fingerprint,
-        duration_s=log.duration_s,
-    )
+    return scans
 
 
 def _built_map(log: RobotLog, config: Config, clock: _Stopwatch) -> BuiltMap:
