@@ -7,7 +7,12 @@ things grow side by side for an hour, it keeps the holes that they leave behind.
 from __future__ import annotations
 
 import ctypes
+import gc
+import mmap
 from contextlib import suppress
+
+import numpy as np
+from numpy.typing import NDArray
 
 OWN_PAGES_BYTES = 4 * 2**20
 """What is larger gets pages of its own, which grow without a copy and go when it goes."""
@@ -26,7 +31,19 @@ def hold_little() -> None:
         library.mallopt(_M_TRIM_THRESHOLD, MOST_FREE_BYTES)
 
 
-def give_back() -> None:
-    """Let the system have all that is free."""
+def give_back(*, with_cycles: bool = False) -> None:
+    """Let the system have all that is free; with objects that only hold one another, if wanted."""
+    if with_cycles:
+        gc.collect()
     with suppress(*_OTHER_LIBRARY):
         ctypes.CDLL(None).malloc_trim(0)
+
+
+def sparse_zeros(rows: int, columns: int) -> NDArray[np.float32]:
+    """Zeros that take memory only where something is written, shape (rows, columns).
+
+    Of an array of its own numpy would have the system make huge pages: one row takes 2 MB there.
+    """
+    numbers = rows * columns
+    pages = mmap.mmap(-1, 4 * max(numbers, 1))
+    return np.frombuffer(pages, dtype=np.float32, count=numbers).reshape(rows, columns)

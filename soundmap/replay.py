@@ -242,6 +242,7 @@ def _measured(
         watchers = [gatherer.see] if built is not None else [gatherer.see, chooser.see]
         scans = _heard(log, array, watchers, config, clock)
         del log  # with the times of all its messages
+        give_back(with_cycles=True)
         surroundings = gatherer.gathered()
         if built is not None:
             room, trajectory = built.room, built.trajectory

@@ -2,9 +2,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from soundmap.memory import give_back, hold_little
+from soundmap.memory import give_back, hold_little, sparse_zeros
 
 STATUS = Path("/proc/self/statm")
 
@@ -23,6 +24,16 @@ def test_what_is_freed_goes_back_although_something_stands_behind_it():
     give_back()
     assert resident_bytes() < full - 80e6
     assert len(behind) == 50_000
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads what Linux tells of memory")
+def test_sparse_zeros_take_memory_only_where_something_is_written():
+    before = resident_bytes()
+    zeros = sparse_zeros(100_000, 250)
+    zeros[::1000] = 1.0
+    assert resident_bytes() < before + 5e6
+    assert np.array_equal(np.flatnonzero(zeros[:, 249]), np.arange(0, 100_000, 1000))
+    assert sparse_zeros(0, 250).shape == (0, 250)
 
 
 LARGE = """

@@ -191,19 +191,13 @@ def _sub_bands(
 def _stands(
     scans: AudioScans, trajectory: Trajectory, array: MicArray, config: ScanConfig
 ) -> _Stands:
-    parts, _ = _sub_bands(scans, config)
-    half_ns = round(0.5 * (config.frames - 1) * config.hop_s * 1e9)
-    offsets = np.linspace(-half_ns, half_ns, max(config.frames, 2)).astype(np.int64)
-    poses = trajectory.at(scans.time_ns[:, None] + offsets)
-    trusted = trajectory.usable_at(scans.time_ns) & np.isfinite(poses).all(axis=(1, 2))
-    trusted &= np.isfinite(parts).all(axis=(1, 2)) & (parts.mean(axis=2) > 0.0).all(axis=1)
-    chosen = np.flatnonzero(trusted)
-    poses = poses[chosen]
-    turns = np.unwrap(poses[:, :, 2], axis=1)
-    frames = len(offsets)
-    turn = np.abs(turns[:, -1] - turns[:, 0]) * frames / (frames - 1)
-    heading = turns.mean(axis=1)
-    base = np.column_stack([poses[:, :, :2].mean(axis=1), heading])
+    """Which scans to use, and where they were taken."""
+    some = [  # not all at once: each has a pose for each of its frames
+        _bases(scans, slice(start, start + SCANS_AT_ONCE), trajectory, config)
+        for start in range(0, max(len(scans), 1), SCANS_AT_ONCE)
+    ]
+    chosen, base, turn = (np.concatenate(each) for each in zip(*some, strict=True))
+    heading = base[:, 2]
     mount = array.mount
     place = transformed(base, np.broadcast_to(mount.translation_m[:2], (len(base), 2)))
     axis = np.asarray(wrapped_angle(heading + mount.yaw_rad))
@@ -213,6 +207,25 @@ def _stands(
         chosen, place, axis, turn = chosen[kept], place[kept], axis[kept], turn[kept]
         group = np.unique(group[kept], return_inverse=True)[1].astype(np.int64)
     return _Stands(chosen, place, axis, turn, group)
+
+
+def _bases(
+    scans: AudioScans, some: slice, trajectory: Trajectory, config: ScanConfig
+) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
+    """Which of some scans are sound and have a trusted pose; this pose (3,), and their turn."""
+    time_ns, parts = scans.time_ns[some], _sub_bands(scans, config)[0][some]
+    half_ns = round(0.5 * (config.frames - 1) * config.hop_s * 1e9)
+    offsets = np.linspace(-half_ns, half_ns, max(config.frames, 2)).astype(np.int64)
+    poses = trajectory.at(time_ns[:, None] + offsets)
+    trusted = trajectory.usable_at(time_ns) & np.isfinite(poses).all(axis=(1, 2))
+    trusted &= np.isfinite(parts).all(axis=(1, 2)) & (parts.mean(axis=2) > 0.0).all(axis=1)
+    chosen = np.flatnonzero(trusted)
+    poses = poses[chosen]
+    turns = np.unwrap(poses[:, :, 2], axis=1)
+    frames = len(offsets)
+    turn = np.abs(turns[:, -1] - turns[:, 0]) * frames / (frames - 1)
+    base = np.column_stack([poses[:, :, :2].mean(axis=1), turns.mean(axis=1)])
+    return some.start + chosen, base, turn
 
 
 def _rests(place_m: FloatArray, axis_rad: FloatArray) -> NDArray[np.int64]:

@@ -7,6 +7,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from soundmap.geometry import FloatArray, Mount, Trajectory, relative, wrapped_angle
+from soundmap.memory import sparse_zeros
 from soundmap.side_by_side import side_by_side
 from soundmap.surroundings import Surroundings
 
@@ -85,7 +86,7 @@ def ranges_around(
     """
     some = np.arange(len(time_ns)) if wanted is None else wanted
     directions = 2.0 * np.pi * np.arange(AROUND) / AROUND
-    ranges = np.zeros((len(time_ns), AROUND), dtype=np.float32)  # pages come as they are filled
+    ranges = sparse_zeros(len(time_ns), AROUND)
     for start in range(0, len(some), ROWS):
         rows = some[start : start + ROWS]
         ranges[rows] = surface_ranges(
