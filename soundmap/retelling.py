@@ -18,7 +18,7 @@ from soundmap.deskew import deskewed_rays
 from soundmap.errors import OutputError, SoundmapError
 from soundmap.fuse.accumulate import PowerAccumulator
 from soundmap.fuse.power_map import fused_scans
-from soundmap.fuse.surroundings import gathered_surroundings
+from soundmap.fuse.surroundings import SurroundingsGatherer
 from soundmap.geometry import FloatArray, transformed
 from soundmap.grid import OccupancyGrid
 from soundmap.logs.robot_log import RobotLog, open_log
@@ -33,6 +33,7 @@ from soundmap.outputs.recording import (
 from soundmap.outputs.stored_run import POWER_RATIO, read_difference, read_run
 from soundmap.run import Run
 from soundmap.sensors import LaserScan
+from soundmap.surroundings import Surroundings
 
 RUN_FILE, DIFFERENCE_FILE = "run.rrd", "diff.rrd"
 LASER_INTERVAL_NS = 200_000_000
@@ -98,8 +99,9 @@ def write_recording(run: Run, file: Path) -> str | None:
         why = f"{error} The recording shows neither laser points nor how the power map grew."
     with run_recording(run, file) as drawn:
         if log is not None:
-            _tell_lasers(log, run, drawn)
-            _tell_fusion(log, run, drawn)
+            surroundings = _tell_lasers(log, run, drawn)
+            del log
+            _tell_fusion(surroundings, run, drawn)
     return why
 
 
@@ -112,11 +114,16 @@ def _unchanged_log(run: Run) -> RobotLog:
     return log
 
 
-def _tell_lasers(log: RobotLog, run: Run, drawn: RunRecording) -> None:
-    """Some laser scans of each scanner, and how well they lie on the map's walls."""
+def _tell_lasers(log: RobotLog, run: Run, drawn: RunRecording) -> Surroundings:
+    """Some laser scans of each scanner, and how well they lie on the map's walls.
+
+    What all of them saw around the robot is gathered on the way.
+    """
     wall = _WallDistance(run.room)
+    gatherer = SurroundingsGatherer(log.odometry)
     shown_ns: dict[int, int] = {}
     for scan in log.lasers():
+        gatherer.see(scan)
         time_ns = scan.middle_ns
         if time_ns - shown_ns.get(scan.scanner, time_ns - LASER_INTERVAL_NS) < LASER_INTERVAL_NS:
             continue
@@ -125,9 +132,10 @@ def _tell_lasers(log: RobotLog, run: Run, drawn: RunRecording) -> None:
             continue
         shown_ns[scan.scanner] = time_ns
         drawn.add_laser(time_ns, scan.scanner, points, wall.share_near(points))
+    return gatherer.gathered()
 
 
-def _tell_fusion(log: RobotLog, run: Run, drawn: RunRecording) -> None:
+def _tell_fusion(surroundings: Surroundings, run: Run, drawn: RunRecording) -> None:
     """Which bearing was chosen at each scan, and the power map as it grew."""
     mount = run.scans.mount
     if mount is None or len(run.scans) == 0:
@@ -139,7 +147,7 @@ def _tell_fusion(log: RobotLog, run: Run, drawn: RunRecording) -> None:
     due_ns = float(run.scans.time_ns[0])
     fused = fused_scans(
         run.scans,
-        gathered_surroundings(log.lasers(), log.odometry),
+        surroundings,
         run.trajectory,
         accumulator,
         mount,

@@ -6,7 +6,7 @@ what happened lies on the log's own time.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
@@ -21,6 +21,7 @@ from soundmap.grid import GridFrame
 from soundmap.outputs.area import Area, area_of_interest, cropped
 from soundmap.outputs.figures import PALE, SURE, not_below, shown_range
 from soundmap.outputs.markdown import difference_markdown, run_markdown
+from soundmap.outputs.piped import piped
 from soundmap.outputs.recording_layout import difference_layout, run_layout
 from soundmap.outputs.recording_shapes import (
     BLUE,
@@ -66,18 +67,18 @@ ELLIPSE_SIGMAS = 2.0
 def recording(file: Path, blueprint: rr.blueprint.Blueprint) -> Iterator[rr.RecordingStream]:
     """A stream whose content becomes a complete file, whatever happens in between.
 
-    The file is written here because a stream that meets a full disk waits for ever.
+    It is piped there because a stream that meets a full disk itself waits for ever.
     """
     stream = rr.RecordingStream(APPLICATION)
-    kept = rr.binary_stream(stream)
-    stream.send_blueprint(blueprint, make_active=False, make_default=True)
-    try:
-        stream.log("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        yield stream
-    finally:
-        content = kept.read(flush=True) or b""
-        stream.disconnect()
-        file.write_bytes(content)
+    with piped(file) as name:
+        stream.save(name)
+        stream.send_blueprint(blueprint, make_active=False, make_default=True)
+        try:
+            stream.log("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+            yield stream
+        finally:
+            stream.flush()
+            stream.disconnect()
 
 
 class RunRecording:
@@ -118,6 +119,8 @@ class RunRecording:
     def add_hit(self, time_ns: int, array_m: FloatArray, point_m: FloatArray) -> None:
         """The bearing chosen: from the array to the surface it meets, x, y in the map frame [m]."""
         self._hits.append((time_ns, array_m, point_m))
+        if len(self._hits) >= ROWS_A_BATCH:
+            self._send_hits()
 
     def add_power_map(self, time_ns: int, power_map: PowerMap) -> None:
         """The power map as it was at a time; every cell measured so far."""
@@ -188,11 +191,12 @@ class RunRecording:
             return
         values, axes = np.linalg.eigh(covariance[:, :2, :2])
         reach = ELLIPSE_SIGMAS * np.sqrt(np.maximum(values, 0.0))
-        ellipses = (circle(1.0)[:, :2] * reach[:, None, :]) @ np.swapaxes(axes, 1, 2)
-        at = ellipses + trajectory.pose[:, None, :2]
-        self._send_curves(
-            "/world/run/pose_uncertainty", trajectory.time_ns, raised(at, LINE_Z), GREEN
-        )
+
+        def ellipses(some: slice) -> FloatArray:
+            own = (circle(1.0)[:, :2] * reach[some, None, :]) @ np.swapaxes(axes[some], 1, 2)
+            return raised(own + trajectory.pose[some, None, :2], LINE_Z)
+
+        self._send_curves("/world/run/pose_uncertainty", trajectory.time_ns, ellipses, GREEN)
         spread = np.sqrt(np.maximum(values.sum(axis=1), 0.0))
         self._send_series("/plots/pose/spread_m", trajectory.time_ns, spread, VERMILION)
 
@@ -213,7 +217,6 @@ class RunRecording:
         scans = self._run.scans
         if len(scans) == 0:
             return
-        level = decibels(scans.power.astype(np.float64))
         loudest, mean = decibels(scans.power.max(axis=1)), decibels(scans.power.mean(axis=1))
         for name, values, colour in (
             ("loudest_bearing", loudest, VERMILION),
@@ -221,16 +224,24 @@ class RunRecording:
         ):
             time_ns, shown = _broken_at_gaps(scans.time_ns, np.asarray(values, dtype=np.float64))
             self._send_series(f"/plots/level/{name}", time_ns, shown, colour)
-        if scans.mount is None:
+        mount = scans.mount
+        if mount is None:
             return
-        low, high = shown_range(level)
-        share = (np.maximum(level, low) - low) / (high - low)
-        radius = LEAST_LOBE_M + (GREATEST_LOBE_M - LEAST_LOBE_M) * share
-        bearing = scans.mount.base_bearing(scans.bearing_rad)
+        sounding = (scans.power > 0.0) & np.isfinite(scans.power)
+        extremes = [np.min(scans.power, where=sounding, initial=np.inf)]
+        extremes += [np.max(scans.power, where=sounding, initial=0.0)]
+        low, high = shown_range(decibels(np.array(extremes, dtype=np.float64)))
+        bearing = mount.base_bearing(scans.bearing_rad)
         towards = np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
-        curves = scans.mount.translation_m[:2] + radius[:, :, None] * towards
-        curves = np.concatenate([curves, curves[:, :1]], axis=1)
-        curves = raised(curves, float(scans.mount.translation_m[2]))
+
+        def curves(some: slice) -> FloatArray:
+            level = decibels(scans.power[some].astype(np.float64))
+            share = (np.maximum(level, low) - low) / (high - low)
+            radius = LEAST_LOBE_M + (GREATEST_LOBE_M - LEAST_LOBE_M) * share
+            around = mount.translation_m[:2] + radius[:, :, None] * towards
+            around = np.concatenate([around, around[:, :1]], axis=1)
+            return raised(around, float(mount.translation_m[2]))
+
         self._send_curves("/world/robot/audio_scan", scans.time_ns, curves, PURPLE)
 
     def _send_lasers(self, scanner: int) -> None:
@@ -248,11 +259,12 @@ class RunRecording:
         self._stream.log(name, style, static=True)
 
     def _send_hits(self) -> None:
-        if not self._hits:
+        hits, self._hits = self._hits, []
+        if not hits:
             return
-        time_ns = [time for time, _, _ in self._hits]
-        ends = raised(np.array([pair[1:] for pair in self._hits]), 3.0 * LINE_Z)
-        self._send_curves("/world/run/chosen_bearing", time_ns, ends, DARK)
+        time_ns = [time for time, _, _ in hits]
+        ends = raised(np.array([pair[1:] for pair in hits]), 3.0 * LINE_Z)
+        self._send_curves("/world/run/chosen_bearing", time_ns, lambda some: ends[some], DARK)
         columns = rr.Points3D.columns(positions=ends[:, 1])
         self._send("/world/run/laser_hit", time_ns, columns.partition([1] * len(ends)))
         style = rr.Points3D.from_fields(colors=[VERMILION], radii=rr.Radius.ui_points(6.0))
@@ -279,10 +291,17 @@ class RunRecording:
             self._stream.reset_time()
 
     def _send_curves(
-        self, name: str, time_ns: ArrayLike, curves: FloatArray, colour: tuple[int, int, int]
+        self,
+        name: str,
+        time_ns: ArrayLike,
+        curves: Callable[[slice], FloatArray],
+        colour: tuple[int, int, int],
     ) -> None:
-        """One line a time, shape (times, points, 3)."""
-        self._send(name, time_ns, rr.LineStrips3D.columns(strips=list(curves)))
+        """One line a time; those of some times have the shape (times, points, 3)."""
+        times = np.asarray(time_ns, dtype=np.int64)
+        for start in range(0, len(times), ROWS_A_BATCH):
+            some = slice(start, start + ROWS_A_BATCH)
+            self._send(name, times[some], rr.LineStrips3D.columns(strips=list(curves(some))))
         style = rr.LineStrips3D.from_fields(colors=[colour], radii=rr.Radius.ui_points(1.5))
         self._stream.log(name, style, static=True)
 
@@ -298,6 +317,7 @@ class RunRecording:
     def _send(self, name: str, time_ns: ArrayLike, columns: rr.ComponentColumnList) -> None:
         times = np.asarray(time_ns, dtype=np.int64).astype("datetime64[ns]")
         self._stream.send_columns(name, [rr.TimeColumn(TIMELINE, timestamp=times)], columns)
+        self._stream.flush()  # or all that is sent would wait in memory
 
 
 @contextmanager
