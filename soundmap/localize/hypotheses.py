@@ -18,6 +18,8 @@ from soundmap.localize.following import Follower, Track
 
 FIRST_SPAN = 24
 """Views over which all hypotheses are followed at first; then twice as many, and so on."""
+MOST_FOLLOWED = 100_000
+"""Views, over all hypotheses, that are followed before the run counts as telling too little."""
 GIVEN_UP = 0.15
 """A hypothesis is given up on the way if the views speak for it so much less than for the best."""
 LEAST_GAP = 0.02
@@ -50,8 +52,10 @@ class Followed:
 
 def surviving(
     follower: Follower, orders: list[NDArray[np.int64]], hypotheses: FloatArray
-) -> list[Followed]:
-    """The hypotheses that the run does not refute, best first.
+) -> tuple[list[Followed], bool]:
+    """The hypotheses that the run does not refute, best first, and whether all of it was asked.
+
+    Where many hypotheses outlive much of the run, which tells no place then, the rest is not asked.
 
     Parameters
     ----------
@@ -66,15 +70,20 @@ def surviving(
         Followed(pose, follower.followed(orders[0][:1], pose, seek=True)) for pose in hypotheses
     ]
     followed = [Followed(each.track.pose[0], each.track) for each in followed]
+    asked = 0
     for order in orders:
         done = 1
         while done < len(order) and (done < FIRST_SPAN or len(followed) > 1):
             stop = min(max(FIRST_SPAN, 2 * done), len(order))
+            asked += len(followed) * (stop - done)
+            if asked > MOST_FOLLOWED:
+                return followed, False
             followed = [_continued(follower, each, order[:stop], done) for each in followed]
             followed = _merged(_not_given_up(followed))
             done = stop
     best = followed[0]
-    return [best, *(each for each in followed[1:] if not _is_refuted(each.track, best.track))]
+    left = [best, *(each for each in followed[1:] if not _is_refuted(each.track, best.track))]
+    return left, True
 
 
 def _continued(

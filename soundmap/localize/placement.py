@@ -7,6 +7,7 @@ leads from both sides, and followed back into the stretch as well as ahead.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +17,16 @@ from soundmap.errors import MapError
 from soundmap.geometry import FloatArray, composed, relative
 from soundmap.grid import OccupancyGrid
 from soundmap.localize.following import Follower, Track
-from soundmap.localize.global_start import start_hypotheses
+from soundmap.localize.global_start import GOLDEN, start_hypotheses
 from soundmap.localize.hypotheses import FIRST_SPAN, LEAST_GAP, Followed, surviving
 from soundmap.localize.views import STAGE, Views
 from soundmap.losses import LossLedger
 
 FIRST_MATCH = 0.6
 """Share of a view that must match before a pose that nothing else speaks for is believed."""
+MATCHED_SCORE = 0.7
+"""Least score of the returns that match, in the search over the whole map: they lie within a few
+centimetres of a surface."""
 MOST_BEYOND = 0.10
 """Share of it that may lie behind the map's walls then."""
 ELSEWHERE_MATCH = 0.8
@@ -34,6 +38,8 @@ ODOMETRY_DRIFT = 0.2
 SEARCH_EVERY_M = 3.0
 """Way between two places from which the pose is sought in the whole map."""
 MOST_SEARCHES = 40
+MOST_UNTOLD = 6
+"""Views, all over the run, that fit in too many places to follow, after which to give up."""
 TOGETHER_NS = 300_000_000
 """Views this close together are matched to the map as one."""
 LOST_M, LOST_S = 1.0, 2.0
@@ -63,8 +69,6 @@ class Placement:
     pose : ndarray, shape (K, 3)
     matched, beyond : ndarray, shape (K,)
         As in `soundmap.localize.agreement.Agreement`.
-    is_cannot_tell : bool
-        Several places fit equally well.
     """
 
     def __init__(
@@ -98,19 +102,31 @@ class Placement:
         everything = np.arange(len(self._views))
         if start_pose is not None:
             orders = [everything]
-            given = surviving(self._follower, orders, start_pose[None, :])
+            given, _ = surviving(self._follower, orders, start_pose[None, :])
             if self._is_proved(given[0], FIRST_MATCH):
                 self._spread(0, given[0].start, everything)
             else:
                 self._remark()
         if start_pose is None or not self.known.any():
-            for view in _search_places(self._views, everything):
-                if self._found(view, everything, edges={}):
-                    break
+            self._find_anywhere(everything)
         for stretch in _stretches(self._views, ~self.known):
             if len(stretch) < len(everything):
                 self._find_again(stretch)
         self.mend()
+
+    def _find_anywhere(self, everything: NDArray[np.int64]) -> None:
+        """Seek the pose of one view after another, all over the run, until one tells the place."""
+        places = np.array(_search_places(self._views, everything))
+        untold = 0
+        for view in places[np.argsort(np.arange(len(places)) * GOLDEN % 1.0)].tolist():
+            outcome = self._found(view, everything, edges={})
+            if outcome == "found":
+                return
+            untold += outcome == "untold"
+            if untold == MOST_UNTOLD:
+                break
+        if untold:
+            raise MapError(CANNOT_TELL)
 
     def _find_again(self, stretch: NDArray[np.int64]) -> None:
         """Seek the pose in a stretch where it has been lost."""
@@ -124,33 +140,44 @@ class Placement:
             if not self.known[view]:
                 self._found(view, stretch, edges)
 
-    def _found(self, view: int, stretch: NDArray[np.int64], edges: dict[int, FloatArray]) -> bool:
-        """Seek the pose of one view; if it is found, place what can be followed from there."""
+    def _found(
+        self, view: int, stretch: NDArray[np.int64], edges: dict[int, FloatArray]
+    ) -> Literal["found", "nowhere", "untold"]:
+        """Seek the pose of one view; if it is found, place what can be followed from there.
+
+        It is untold where so many places fit that not all of them can be followed until the run
+        refutes them: the one that seems best is then no better than those that were left out.
+        """
         views = self._views
         near = np.abs(views.time_ns[stretch] - views.time_ns[view]) < TOGETHER_NS
         rays = views.joined_rays(stretch[near].tolist(), view)
-        hypotheses, _ = start_hypotheses(self._room, rays)
+        needed = ELSEWHERE_MATCH if edges else FIRST_MATCH
+        sought = start_hypotheses(self._room, rays, least_score=MATCHED_SCORE * needed)
         carried = [carried_pose(views, edge, pose, view) for edge, pose in edges.items()]
-        hypotheses = np.concatenate([hypotheses, np.array(carried).reshape(-1, 3)])
+        hypotheses = np.concatenate([sought.pose, np.array(carried).reshape(-1, 3)])
         if len(hypotheses) == 0:
-            raise MapError("the map has no free space in which the robot could stand.")
+            return "untold" if sought.are_too_many else "nowhere"
         ahead, back = stretch[stretch >= view], stretch[stretch <= view][::-1]
         orders = sorted([ahead, back], key=len, reverse=True)
         driven_m = views.driven_m[stretch]
         is_long = driven_m[-1] - driven_m[0] >= ELSEWHERE_WAY_M
+        survivors, is_settled = surviving(self._follower, orders, hypotheses)
+        is_sure = is_settled and not sought.are_too_many
         proved = []
-        for each in surviving(self._follower, orders, hypotheses):
+        for each in survivors:
             expected = any(leads_to(views, edge, edges[edge], view, each.start) for edge in edges)
             needed = FIRST_MATCH if expected or not edges else ELSEWHERE_MATCH
             if (expected or not edges or is_long) and self._is_proved(each, needed):
                 proved.append((each, expected))
         likely = [each for each, expected in proved if expected] or [each for each, _ in proved]
-        if len(likely) > 1 and not edges:
+        if len(likely) > 1 and not edges and is_sure:
             raise MapError(CANNOT_TELL)
+        if likely and not (is_sure or any(expected for _, expected in proved)):
+            return "untold"
         if len(likely) != 1:
-            return False
+            return "nowhere"
         self._spread(view, likely[0].start, stretch)
-        return True
+        return "found"
 
     def mend(self) -> None:
         """Where odometry cannot have led from one known view to the next, follow across.

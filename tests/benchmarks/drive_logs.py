@@ -17,6 +17,7 @@ from soundmap.sensors import LaserScan
 from soundmap.simulate.drive_log import laser_messages, mount_message, odometry_messages
 from soundmap.simulate.log_writer import Topic, write_log
 from soundmap.simulate.map_image import drawn_map
+from soundmap.simulate.scene import Scene
 from soundmap.simulate.scene_file import loaded_scene
 from soundmap.simulate.simulation import drive_of
 
@@ -39,7 +40,12 @@ def simulated_drive(
     robot = scene.robot
     if way_points_m is not None:
         robot = robot.model_copy(update={"way_points_m": tuple(way_points_m), "heading_deg": None})
-    scene = scene.model_copy(update={"robot": robot, "seed": seed})
+    return drive_through(scene.model_copy(update={"robot": robot, "seed": seed}))
+
+
+def drive_through(scene: Scene) -> Drive:
+    """The drive of a scene."""
+    seed = scene.seed
     drive, _ = drive_of(scene)
     odometry, _ = odometry_messages(drive, np.random.default_rng([seed, 1]))
     topics = [

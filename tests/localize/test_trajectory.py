@@ -5,11 +5,9 @@ import pytest
 import worlds
 
 from soundmap.config import LocalizeConfig
-from soundmap.deskew import deskewed_rays
 from soundmap.errors import MapError, NothingUsableError
 from soundmap.geometry import Trajectory, composed, relative, wrapped_angle
 from soundmap.grid import GridFrame, OccupancyGrid
-from soundmap.localize.global_start import start_hypotheses
 from soundmap.localize.placement import Placement
 from soundmap.localize.smoothing import chained
 from soundmap.localize.trajectory import estimate_trajectory
@@ -131,35 +129,6 @@ def test_the_same_input_gives_the_same_trajectory():
     first, second = (estimate_trajectory(short, odometry_of(TRUTH), ROOM, CONFIG) for _ in range(2))
     assert np.array_equal(first.pose, second.pose)
     assert np.array_equal(first.time_ns, second.time_ns)
-
-
-def test_hypotheses_of_a_symmetric_room_hold_both_of_its_ends():
-    frame = GridFrame(0.05, (0.0, 0.0), (60, 120))
-    occupied = np.zeros(frame.shape, dtype=bool)
-    occupied[[10, 50], 10:111] = True
-    occupied[10:51, [10, 110]] = True
-    free = np.zeros(frame.shape, dtype=bool)
-    free[11:50, 11:110] = True
-    room = OccupancyGrid(frame, occupied, free)
-    bearing = np.linspace(-np.pi, np.pi, 180, endpoint=False)
-    pose = np.array([2.0, 1.0, 0.4])
-    direction = bearing + pose[2]
-    with np.errstate(divide="ignore"):
-        along_x = np.where(np.cos(direction) > 0, 5.525 - 2.0, 2.0 - 0.525) / abs(np.cos(direction))
-        along_y = np.where(np.sin(direction) > 0, 2.525 - 1.0, 1.0 - 0.525) / abs(np.sin(direction))
-    ranges = np.minimum(along_x, along_y)
-    scan = replace(
-        SCANS[0], ray_interval_ns=0.0, bearing_rad=bearing, range_m=ranges, mount=worlds.FRONT
-    )
-    rays = deskewed_rays(scan, TRUTH, scan.middle_ns, most=90)
-    hypotheses, score = start_hypotheses(room, rays)
-    base = composed(pose, [-0.2, 0.0, 0.0])
-    mirrored = np.array([6.05 - base[0], 3.05 - base[1], base[2] - np.pi])
-    for expected in (base, mirrored):
-        off = hypotheses - expected
-        near = np.hypot(off[:, 0], off[:, 1]) + np.abs(wrapped_angle(off[:, 2]))
-        assert near.min() < 0.1
-        assert score[near.argmin()] > 0.9 * score.max()
 
 
 class TestFaults:
@@ -322,6 +291,53 @@ class TestPlacesThatLookAlike:
         estimate = estimate_trajectory(self.scans(outline), odometry, room, CONFIG)
         assert estimate.usable.mean() > 0.95
         assert errors(estimate, self.truth)[0][estimate.usable].max() < 0.08
+
+
+class TestAHallOfWhichTheScannerSeesOneWall:
+    """60 m x 40 m and a scanner of 25 m: hundreds of places along the walls fit the first scans."""
+
+    outline = np.array([[0.0, 0.0], [60.0, 0.0], [60.0, 40.0], [0.0, 40.0]]) + worlds.HALF
+    frame = GridFrame(0.05, (-1.0, -1.0), (840, 1240))
+
+    def drive(self, outline, way):
+        truth = worlds.driven(way, speed=1.0)
+        rings = (np.array(outline),)
+        scans = worlds.laser_scans(truth, [worlds.FRONT], rate_hz=5.0, beams=181, rings=rings)
+        seen = [
+            replace(scan, range_m=np.where(scan.range_m < 25.0, scan.range_m, np.nan))
+            for scan in scans
+        ]
+        odometry = odometry_of(truth, scale=1.005)
+        return truth, seen, odometry, worlds.room(rings, self.frame)
+
+    def niched(self):
+        niche = np.array([[52.0, 0.0], [52.0, -0.5], [54.0, -0.5], [54.0, 0.0]]) + worlds.HALF
+        return np.concatenate([self.outline[:1], niche, self.outline[1:]])
+
+    @pytest.mark.parametrize(
+        "way", [[(36.0, 37.0), (22.0, 37.0), (22.0, 34.0)], [(30.0, 3.0), (50.0, 3.0)]]
+    )
+    def test_no_place_is_told_that_half_a_turn_of_the_hall_makes_another_one(self, way):
+        _, scans, odometry, room = self.drive(self.outline, way)
+        with pytest.raises(MapError, match=r"looks alike in several places.*--start-pose"):
+            estimate_trajectory(scans, odometry, room, CONFIG)
+
+    def test_a_niche_that_comes_into_sight_later_tells(self):
+        truth, scans, odometry, room = self.drive(self.niched(), [(26.0, 3.0), (56.0, 3.0)])
+        estimate = estimate_trajectory(scans, odometry, room, CONFIG)
+        assert estimate.usable.mean() > 0.9
+        assert errors(estimate, truth)[0][estimate.usable].max() < 0.15
+
+    def test_a_start_off_along_the_wall_is_mended_from_where_the_place_was_plain(self):
+        """Followed ahead alone, a third is off: at first the niche is too small to tell."""
+        truth, scans, odometry, room = self.drive(self.niched(), [(26.0, 3.0), (56.0, 3.0)])
+        views = chosen_views(scans, odometry, CONFIG, LossLedger())
+        placement = Placement(room, views, CONFIG, LossLedger())
+        true = truth.at(views.time_ns)
+        placement.find(true[0] + [-0.6, 0.0, 0.0])
+        off_m = np.hypot(*(placement.pose - true)[:, :2].T)
+        assert placement.known.all()
+        assert np.mean(off_m > 0.15) < 0.27
 
 
 def test_smoothing_brings_the_poses_nearer_to_the_truth():
