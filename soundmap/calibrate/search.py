@@ -22,6 +22,7 @@ CLOCKS_S = 0.04 * np.arange(-2, 3)
 YAWS_RAD = np.radians(3.0) * np.arange(-3, 4)
 STARTS = 3
 CELL_M, REACH_M = 0.20, 4.0
+CELLS_AT_ONCE = 1000
 DIRECTIONS = 240
 VOTE_RAD = np.radians(3.5)
 """Standard deviation of a vote over the bearings."""
@@ -73,9 +74,12 @@ def ballot(way: Way, peaks: Peaks, first: int, last: int) -> Ballot:
     low, high = place.min(axis=0) - REACH_M, place.max(axis=0) + REACH_M
     x, y = (np.arange(low[i], high[i], CELL_M) for i in range(2))
     cell = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    step = cell[:, None] - place
-    bearing = np.arctan2(step[..., 1], step[..., 0]) - axis
-    direction = np.floor(bearing * DIRECTIONS / (2.0 * np.pi)).astype(np.int64) % DIRECTIONS
+    direction = np.empty((len(cell), len(scans)), dtype=np.int16)
+    for start in range(0, len(cell), CELLS_AT_ONCE):
+        some = slice(start, start + CELLS_AT_ONCE)
+        step = cell[some, None] - place
+        bearing = np.arctan2(step[..., 1], step[..., 0]) - axis
+        direction[some] = np.floor(bearing * DIRECTIONS / (2.0 * np.pi)) % DIRECTIONS
     row = np.full(last, -1)
     row[scans] = np.arange(len(scans))
     inside = (peaks.scan >= first) & (peaks.scan < last)
@@ -87,7 +91,7 @@ def ballot(way: Way, peaks: Peaks, first: int, last: int) -> Ballot:
     cast = (weight[:, None] * np.exp(-0.5 * away**2)).astype(np.float32)
     np.maximum.at(votes, row[peaks.scan[inside]], cast)
     own_bins = round(min(peaks.blur * OWN_RAD, np.pi / 2.0) * DIRECTIONS / (2.0 * np.pi))
-    return Ballot(cell, direction.astype(np.int16), way.turn_rad_s[scans], votes, own_bins)
+    return Ballot(cell, direction, way.turn_rad_s[scans], votes, own_bins)
 
 
 def starting_points(ballots: list[Ballot]) -> list[tuple[float, float]]:

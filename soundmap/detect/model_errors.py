@@ -77,7 +77,6 @@ class Precision:
                         kept.append(mode[:, own].copy())
             for kept, inverse in zip(loud, self.inverse, strict=True):
                 inverse[scans] = _inverse(kept, inverse.shape[1])
-                kept.clear()
 
         side_by_side(invert, parts(len(evidence)))
 
@@ -107,11 +106,13 @@ def _is_loud(mode: Single) -> bool:
 
 
 def _inverse(modes: list[Single], size: int) -> Single:
-    """Inverse of the identity plus the squares of all modes, each (S, d)."""
+    """Inverse of the identity plus the squares of all modes, each (S, d); it takes them away."""
     if not modes:
         return np.eye(size, dtype=np.float32)[None]
     stacked = np.stack(modes, axis=1)
+    modes.clear()
     covariance = np.matmul(stacked.transpose(0, 2, 1), stacked)
+    del stacked
     covariance[:, np.arange(size), np.arange(size)] += 1.0
     return np.asarray(np.linalg.inv(covariance), dtype=np.float32)
 

@@ -143,7 +143,7 @@ class _ScanReader:
 
     def __init__(self, stream: LaserStream, scanner: int) -> None:
         self.stream, self.scanner = stream, scanner
-        self._times = iter(stream.time_ns.tolist())
+        self._times = map(int, stream.time_ns)
         self._bearings: dict[tuple[float, float, int], FloatArray] = {}
         self._mounts: dict[Any, Mount] = {}
 
