@@ -282,6 +282,8 @@ def main() -> None:
     # several-fold to their waiting for one another. Read when numpy is first imported.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    # Threads of compiled kernels would spin for a while after each, in case another one follows.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     home = os.path.expanduser("~")
     folder = kernel_cache_folder(
         Path(__file__).parent, os.environ, Path(home) if os.path.isabs(home) else None

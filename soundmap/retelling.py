@@ -23,6 +23,7 @@ from soundmap.geometry import FloatArray, transformed
 from soundmap.grid import OccupancyGrid
 from soundmap.logs.robot_log import RobotLog, open_log
 from soundmap.losses import LossLedger
+from soundmap.memory import give_back
 from soundmap.outputs.new_folder import writing
 from soundmap.outputs.progress import Progress
 from soundmap.outputs.recording import (
@@ -95,6 +96,7 @@ def write_recording(run: Run, file: Path) -> str | None:
     why: str | None = None
     try:
         log = _unchanged_log(run)
+        give_back(with_cycles=True)
     except SoundmapError as error:
         why = f"{error} The recording shows neither laser points nor how the power map grew."
     with run_recording(run, file) as drawn:
