@@ -16,7 +16,7 @@ from soundmap.config import LocalizeConfig
 from soundmap.errors import MapError
 from soundmap.geometry import FloatArray, composed, relative
 from soundmap.grid import OccupancyGrid
-from soundmap.localize.following import Follower, Track
+from soundmap.localize.following import LOOKED_FOR_M, Follower, Track
 from soundmap.localize.global_start import GOLDEN, start_hypotheses
 from soundmap.localize.hypotheses import FIRST_SPAN, LEAST_GAP, Followed, surviving
 from soundmap.localize.views import STAGE, Views
@@ -157,9 +157,10 @@ class Placement:
         hypotheses = np.concatenate([sought.pose, np.array(carried).reshape(-1, 3)])
         if len(hypotheses) == 0:
             return "untold" if sought.are_too_many else "nowhere"
-        ahead, back = stretch[stretch >= view], stretch[stretch <= view][::-1]
+        piece = _unbroken(views, stretch, view)
+        ahead, back = piece[piece >= view], piece[piece <= view][::-1]
         orders = sorted([ahead, back], key=len, reverse=True)
-        driven_m = views.driven_m[stretch]
+        driven_m = views.driven_m[piece]
         is_long = driven_m[-1] - driven_m[0] >= ELSEWHERE_WAY_M
         survivors, is_settled = surviving(self._follower, orders, hypotheses)
         is_sure = is_settled and not sought.are_too_many
@@ -259,6 +260,17 @@ def _stretches(views: Views, lost: NDArray[np.bool_]) -> Iterator[NDArray[np.int
         took_s = (views.time_ns[end - 1] - views.time_ns[begin]) * 1e-9
         if way_m >= LOST_M or took_s >= LOST_S:
             yield np.arange(begin, end)
+
+
+def _unbroken(views: Views, stretch: NDArray[np.int64], view: int) -> NDArray[np.int64]:
+    """The part of a stretch about one view in which scan follows scan.
+
+    Over a longer way without one, odometry drifts out of reach of a search nearby: what does not
+    match behind it does not refute a place.
+    """
+    cuts = np.flatnonzero(np.diff(views.driven_m[stretch]) > LOOKED_FOR_M) + 1
+    own = np.searchsorted(stretch[cuts], view, side="right")
+    return np.split(stretch, cuts)[own]
 
 
 def _known_pieces(

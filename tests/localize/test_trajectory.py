@@ -8,7 +8,7 @@ from soundmap.config import LocalizeConfig
 from soundmap.errors import MapError, NothingUsableError
 from soundmap.geometry import Trajectory, composed, relative, wrapped_angle
 from soundmap.grid import GridFrame, OccupancyGrid
-from soundmap.localize.placement import Placement
+from soundmap.localize.placement import Placement, _unbroken
 from soundmap.localize.smoothing import chained
 from soundmap.localize.trajectory import estimate_trajectory
 from soundmap.localize.views import chosen_views
@@ -412,6 +412,21 @@ def test_a_robot_that_was_carried_elsewhere_is_left_there():
     off = moved.pose - placement.pose
     assert np.hypot(off[:, 0], off[:, 1])[moved.known].max() < 0.1
     assert moved.known.mean() > 0.9
+
+
+def test_scans_behind_a_long_way_without_any_do_not_refute_a_place():
+    """Odometry has drifted out of reach there: they say nothing for or against it."""
+    gone = (TRUTH.pose[:, 1] > 2.0) & (TRUTH.pose[:, 0] < 3.8)
+    seen = [scan for scan in SCANS if not np.interp(scan.time_ns, TRUTH.time_ns, gone)]
+    views = chosen_views(seen, odometry_of(TRUTH), CONFIG, LossLedger())
+    everything = np.arange(len(views))
+    gap_m = np.diff(views.driven_m)
+    assert np.count_nonzero(gap_m > 3.0) == 1
+    before, after = np.split(everything, [int(gap_m.argmax()) + 1])
+    for piece in (before, after):
+        for view in (piece[0], piece[-1]):
+            assert np.array_equal(_unbroken(views, everything, int(view)), piece)
+    assert np.array_equal(_unbroken(views, after[2:], int(after[5])), after[2:])
 
 
 def test_a_wheel_that_slips_half_a_metre_leaves_right_poses_or_flagged_ones():
