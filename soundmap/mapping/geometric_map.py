@@ -40,6 +40,8 @@ UNKNOWN_SCALE = 0.03
 """What stays unknown of the odometry's scale after it has been learnt [m/m]."""
 MOST_DRIFT_M = 0.2
 """A pose that may have drifted farther from those that are held in place is not usable."""
+CARRIED_M = 3.0
+"""Over more way than this without a surface in sight odometry, which bends, ties no two places."""
 RARE_NS = 200_000_000
 """Where laser scans are farther apart, the trajectory has the poses of the odometry as well."""
 GROWING, RELAXING = 0.7, 0.3
@@ -163,19 +165,27 @@ def build_map(
         count=int(np.count_nonzero(~graph.matched)),
     )
     driven_m = np.array([scan.driven_m for scan in keys.scans])
-    held = held_in_place(pose, _of_surfaces(links, len(pose)), driven_m, most_drift_m=MOST_DRIFT_M)
+    surfaces = _of_surfaces(links, len(pose))
+    held = held_in_place(pose, surfaces, driven_m, most_drift_m=MOST_DRIFT_M)
+    tied = tied_together(surfaces, driven_m)
     losses.add(
         "laser scan whose surroundings do not tell the way along them",
         STAGE,
         effect="pose flagged",
         count=int(np.count_nonzero(~held)),
     )
+    losses.add(
+        "laser scan that odometry alone ties to the map, over metres without a surface in sight",
+        STAGE,
+        effect="pose flagged, the map may be wrong there",
+        count=int(np.count_nonzero(~tied)),
+    )
     facts = _facts(keys, pose, links, graph.matched, search, model)
     pose = composed(inverted(pose[0]), pose)
     key_ns = np.array([key.time_ns for key in keys.scans], dtype=np.int64)
     return BuiltMap(
         drawn_map(keys.scans, pose, cell_m=config.cell_m, occupied_share=config.occupied_share),
-        carried_trajectory(keys.time_ns, odometry, key_ns, pose, graph.matched & held),
+        carried_trajectory(keys.time_ns, odometry, key_ns, pose, graph.matched & held & tied),
         facts,
     )
 
@@ -316,6 +326,27 @@ def held_in_place(
     return UNKNOWN_SCALE * away_m <= most_drift_m
 
 
+def tied_together(links: Links, driven_m: FloatArray) -> NDArray[np.bool_]:
+    """Which key scans belong to the greatest piece of the map that surfaces hold together.
+
+    Parameters
+    ----------
+    links : Links
+        Those that come from surfaces.
+    driven_m : ndarray, shape (K,)
+        Way up to each scan [m].
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    count = len(driven_m)
+    near = np.flatnonzero(np.diff(driven_m) <= CARRIED_M)
+    pairs = np.concatenate([links.pairs, np.stack([near, near + 1], axis=-1)])
+    ties = coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(count, count))
+    _, piece = connected_components(ties, directed=False)
+    return np.asarray(piece == np.bincount(piece).argmax())
+
+
 def _fitted_model(
     scans: Sequence[KeyScan], pose: FloatArray, model: OdometryModel
 ) -> OdometryModel:
@@ -357,4 +388,8 @@ def carried_trajectory(
     carried, before, after = carried_poses(time_ns, odometry, key_ns, pose)
     slips = np.concatenate([[False], slipped(odometry.at(key_ns), pose), [False]])
     usable = (matched[before] | matched[after]) & ~(slips[after] | slips[before + 1])
+    driven_m = odometry.driven_m()
+    at_m, key_m = (np.interp(ns, odometry.time_ns, driven_m) for ns in (time_ns, key_ns))
+    away_m = np.minimum(np.abs(at_m - key_m[before]), np.abs(at_m - key_m[after]))
+    usable &= away_m <= CARRIED_M
     return Trajectory(time_ns, carried, usable, is_scan=np.isin(time_ns, scan_ns))

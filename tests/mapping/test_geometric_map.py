@@ -8,7 +8,12 @@ from soundmap.config import MappingConfig
 from soundmap.errors import NothingUsableError
 from soundmap.geometry import Trajectory, composed, transformed
 from soundmap.losses import LossLedger
-from soundmap.mapping.geometric_map import build_map, carried_trajectory, held_in_place
+from soundmap.mapping.geometric_map import (
+    build_map,
+    carried_trajectory,
+    held_in_place,
+    tied_together,
+)
 from soundmap.mapping.pose_graph import Links
 from tests import worlds
 from tests.mapping import drives
@@ -172,3 +177,24 @@ def test_scans_are_held_by_walls_that_run_two_ways_and_for_some_way_by_odometry(
     held = held_in_place(pose, links, driven_m, most_drift_m=0.2)
     assert held[:16].all()
     assert not held[17:].any()
+
+
+def test_what_odometry_alone_ties_to_the_map_over_metres_is_flagged_until_a_surface_ties_it():
+    driven_m = np.concatenate([0.2 * np.arange(20), 3.8 + 8.0 + 0.2 * np.arange(10)])
+    index = np.delete(np.arange(1, 30), 19)
+    pairs = np.stack([index, index - 1], axis=-1)
+    links = Links(pairs, np.zeros((28, 3)), np.tile(1e4 * np.eye(3), (28, 1, 1)))
+    assert np.array_equal(tied_together(links, driven_m), np.arange(30) < 20)
+    pairs = np.concatenate([pairs, [[25, 3]]])
+    seen_again = Links(pairs, np.zeros((29, 3)), np.tile(1e4 * np.eye(3), (29, 1, 1)))
+    assert tied_together(seen_again, driven_m).all()
+
+
+def test_poses_that_odometry_carries_on_for_metres_behind_the_last_scan_are_flagged():
+    time_ns = np.arange(100, dtype=np.int64) * 100_000_000
+    pose = np.column_stack([0.1 * np.arange(100), np.zeros(100), np.zeros(100)])
+    odometry = Trajectory(time_ns, pose, np.ones(100, dtype=bool))
+    key = np.arange(0, 41, 2)
+    fits = np.ones(len(key), dtype=bool)
+    carried = carried_trajectory(time_ns, odometry, time_ns[key], pose[key], fits)
+    assert np.array_equal(carried.usable, pose[:, 0] < 4.0 + 3.0 + 0.05)
