@@ -172,7 +172,9 @@ class Placement:
                 proved.append((each, expected))
         likely = [each for each, expected in proved if expected] or [each for each, _ in proved]
         if len(likely) > 1 and not edges and is_sure:
-            raise MapError(CANNOT_TELL)
+            if len(piece) == len(stretch):
+                raise MapError(CANNOT_TELL)
+            return "untold"  # another part of the run may tell
         if likely and not (is_sure or any(expected for _, expected in proved)):
             return "untold"
         if len(likely) != 1:
