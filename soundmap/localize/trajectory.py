@@ -283,7 +283,9 @@ def _joined(known: Trajectory, odometry: Trajectory) -> Trajectory:
 def _why_lost(estimate: Estimate, room: OccupancyGrid) -> str:
     matched, beyond = float(np.median(estimate.matched)), float(np.median(estimate.beyond))
     if matched >= FIRST_MATCH and beyond <= MOST_BEYOND:
-        return CANNOT_TELL if estimate.covariance is None else _why_unknown(estimate.covariance)
+        return (
+            CANNOT_TELL if estimate.covariance is None else _why_unknown(estimate.covariance, room)
+        )
     left, right, bottom, top = room.frame.extent_m
     return (
         f"the laser scans do not match the map, which spans x {left:.1f} to {right:.1f} m and "
@@ -294,10 +296,13 @@ def _why_lost(estimate: Estimate, room: OccupancyGrid) -> str:
     )
 
 
-def _why_unknown(covariance: FloatArray) -> str:
+def _why_unknown(covariance: FloatArray, room: OccupancyGrid) -> str:
     spread_m = float(np.sqrt(np.trace(covariance[:, :2, :2], axis1=1, axis2=2)).min())
+    left, right, bottom, top = room.frame.extent_m
+    is_anywhere = spread_m > 0.5 * max(right - left, top - bottom)
+    known = "nowhere known" if is_anywhere else f"known to {spread_m:.1f} m at best"
     return (
         "the laser scans match the map, but nothing in their reach tells where along its walls the "
-        f"robot is: its place is known to {spread_m:.1f} m at best. Does the run pass a corner, a "
+        f"robot is: its place along them is {known}. Does the run pass a corner, a "
         "door or the end of the corridor?"
     )

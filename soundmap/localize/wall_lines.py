@@ -23,7 +23,8 @@ REACH_M = 0.15
 """Returns farther than this from a surface cell do not belong to it."""
 LEAST_POINTS = 6
 FLATNESS = 0.2
-"""Greatest ratio of the variances across and along a line that still is one."""
+"""Greatest ratio of the variances across and along a line that still is one. Where noise leaves
+none, the map's own cells serve as well."""
 SURE_RAD = np.radians(3.0)
 """How well a straight wall of the map tells its direction; what is no such wall needs returns that
 tell as well."""
