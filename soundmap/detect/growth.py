@@ -20,7 +20,7 @@ from soundmap.detect.sound_paths import Kind, Path
 from soundmap.detect.sparse_fit import Component, SparseFit
 from soundmap.geometry import FloatArray
 
-LEAST_GAIN = 150.0
+LEAST_GAIN = 100.0
 """The fit grows until no candidate explains more than this, in units of the noise."""
 LEAST_SHARE = 0.35
 """Candidates of one round explain at least this share of what the best near them does."""
@@ -29,6 +29,8 @@ AT_ONCE = 4
 MOST_ROUNDS, MOST_COMPONENTS = 18, 24
 ONE_SOURCE_M = 0.75
 """Components nearer to each other than this may be one source."""
+SURELY_ONE_M = 0.3
+"""Nearer ones are."""
 BESIDE_M = 0.3
 IN_VIEW_SHARE = 0.7
 """An image becomes a source if as such it explains at least this share of what it and all within
@@ -75,6 +77,7 @@ def _grown(
 ) -> SparseFit:
     """Components added until no candidate explains as much as the least gain."""
     fit = SparseFit(evidence, walls)
+    fit.refit()
     for _ in range(MOST_ROUNDS):
         matched = matched_scans(evidence, fit.residual, fit.precision)
         found = best_candidates(
@@ -157,7 +160,8 @@ def _merge(fit: SparseFit) -> None:
         fit.refit()
         for _ in range(STEPS):
             fit.move([joint])
-        if fit.misfit - before > may_lose:
+        away = float(np.hypot(*(first.place_m - second.place_m)))
+        if away > SURELY_ONE_M and fit.misfit - before > may_lose:
             fit.components = kept
             fit.refit()
 

@@ -24,7 +24,7 @@ from soundmap.detect.model_errors import Precision
 from soundmap.detect.sound_paths import NEAREST_M, REACH_M, Kind, seen
 from soundmap.geometry import FloatArray
 
-HEIGHTS_M = np.array([0.2, 0.6])
+HEIGHTS_M = np.array([0.2, 0.6, 1.1])
 """Heights between array and source that are tried [m]."""
 CLASSES = np.array([0, 4])
 """Apertures at which energies are worked out."""

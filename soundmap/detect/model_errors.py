@@ -14,7 +14,7 @@ and what a weak source adds counts only as far as no error of a loud one could h
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Protocol
 
 import numpy as np
@@ -35,6 +35,8 @@ REFLECTION_ERROR = 0.35
 """Of the share of power that walls and the floor reflect."""
 HIDDEN_ERROR = 0.35
 """Of the share that passes a surface in the way."""
+FAR_FIELD_ERROR = 0.35
+"""Of what the far field adds to one scan, over what it adds on average."""
 LEAST_MODE = 0.05
 """A mode whose energy stays below this in all scans changes nothing."""
 SCANS_AT_ONCE = 128
@@ -50,13 +52,25 @@ class Sounding(Protocol):
 class Precision:
     r"""Inverse covariance :math:`\Sigma^{-1}` of every scan, sub-band by sub-band.
 
+    Parameters
+    ----------
+    evidence : Evidence
+    components : sequence of Sounding
+    far_field : ndarray of float32, shape (S, D), optional
+        What the far field adds to the scans.
+
     Attributes
     ----------
     inverse : list of ndarray of float32
         One (S, d, d) for each sub-band.
     """
 
-    def __init__(self, evidence: Evidence, components: Sequence[Sounding]) -> None:
+    def __init__(
+        self,
+        evidence: Evidence,
+        components: Sequence[Sounding],
+        far_field: Single | None = None,
+    ) -> None:
         starts = evidence.table.starts
         self.starts = starts
         sizes = [stop - start for start, stop in pairwise(starts)]
@@ -71,7 +85,10 @@ class Precision:
 
         def invert(scans: slice) -> None:
             loud: list[list[Single]] = [[] for _ in self.inverse]  # what is quiet goes at once
-            for mode in (mode for each in components for mode in _modes(evidence, each, scans)):
+            modes = [_modes(evidence, each, scans) for each in components]
+            if far_field is not None:
+                modes.append(iter([np.float32(FAR_FIELD_ERROR) * far_field[scans]]))
+            for mode in chain.from_iterable(modes):
                 for kept, own in zip(loud, bands, strict=True):
                     if _is_loud(mode[:, own]):
                         kept.append(mode[:, own].copy())

@@ -1,10 +1,11 @@
 r"""Sparse fit: the few places whose sounds together explain what all scans have heard.
 
-.. math:: y_s = \sum_k q_k \, a_{k,s} + e_s, \quad e_s \sim N(0, \Sigma_s)
+.. math:: y_s = \sum_k q_k \, a_{k,s} + A_s f + e_s, \quad e_s \sim N(0, \Sigma_s)
 
 y are the evened-out harmonics of a scan, a what a source of strength 1 adds to them along all its
-paths, q its strength in each sub-band, and :math:`\Sigma` the covariance of noise and model errors.
-Strengths are those of generalised least squares, not negative. Places move by their bearings alone:
+paths, q its strength in each sub-band, f the far field (`soundmap.detect.far_field`), and
+:math:`\Sigma` the covariance of noise and model errors. Strengths are those of generalised least
+squares, not negative. Places move by their bearings alone:
 how strengths change along the way is the business of reflections and directivity as much as of
 distance, and would pull them off.
 """
@@ -20,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soundmap.detect.evidence import Evidence
+from soundmap.detect.far_field import FarField
 from soundmap.detect.harmonics import Single
 from soundmap.detect.model_errors import Precision, bearing_derivative, parts
 from soundmap.detect.sound_paths import NEAREST_M, Kind, Path, Paths, sound_paths, waves_heard
@@ -75,6 +77,8 @@ class Component:
         For each `Share` those paths that have it and that any scan hears.
     weighted : ndarray of float32, shape (S, D), optional
         Its column times the precision that is `weighted_by`; kept since refits are many.
+    coupling : ndarray, shape (D,), optional
+        Products of that with the columns of the far field.
     """
 
     place_m: FloatArray
@@ -87,6 +91,7 @@ class Component:
     ways: dict[Share, list[int]] = field(default_factory=dict)
     weighted: Single | None = None
     weighted_by: Precision | None = None
+    coupling: FloatArray | None = None
 
 
 class SparseFit:
@@ -107,10 +112,11 @@ class SparseFit:
         self.evidence, self.walls = evidence, walls
         self.components: list[Component] = []
         self.residual = evidence.heard
-        self.precision = Precision(evidence, [])
+        self.far_field = FarField(evidence)
+        self._far_heard: Single | None = None
+        self._weigh(Precision(evidence, []))
         self.gram = np.zeros((evidence.sub_bands, 0, 0))
         self._product = np.zeros((evidence.sub_bands, 0))
-        self._energy = self._bands(evidence.heard, self.precision.times(evidence.heard))
 
     @property
     def misfit(self) -> float:
@@ -153,9 +159,20 @@ class SparseFit:
         new = [each for each in self.components if each.weighted_by is not self.precision]
         if new:
             weighted = self.precision.times(np.stack([each.column for each in new]))
-            for component, own in zip(new, weighted, strict=True):
+            couplings = self.far_field.pull(weighted)
+            for component, own, coupling in zip(new, weighted, couplings, strict=True):
                 component.weighted, component.weighted_by = own, self.precision
+                component.coupling = coupling
         return np.stack([each.weighted for each in self.components if each.weighted is not None])
+
+    def pulls(self) -> Single:
+        """What each number heard says for more strength of each component, shape (K, S, D).
+
+        The far field follows the strengths, and its harmonics stand for D there.
+        """
+        held = (self._couplings() @ self._far_inverse).astype(np.float32)
+        far = self.far_field.pulls(self.precision.times(self.residual))
+        return self.weighted_columns() * self.residual - held[:, None] * far
 
     def misfit_of(self, components: list[Component]) -> float:
         """What would be left if there were only some of the components."""
@@ -163,9 +180,7 @@ class SparseFit:
 
     def renew(self) -> None:
         """Model errors as of the present strengths, and strengths as of these errors."""
-        self.precision = Precision(self.evidence, self.components)
-        heard = self.evidence.heard
-        self._energy = self._bands(heard, self.precision.times(heard))
+        self._weigh(Precision(self.evidence, self.components, self._far_heard))
         self.refit()
 
     def refit(self) -> None:
@@ -258,6 +273,31 @@ class SparseFit:
             strength = np.where(told > 0.0, match / told, np.nan)
         return np.asarray(strength, dtype=np.float64), np.asarray(told, dtype=np.float64)
 
+    def _weigh(self, precision: Precision) -> None:
+        """Take a precision, and with it all that does not hang on components."""
+        heard, starts = self.evidence.heard, self.evidence.table.starts[:-1]
+        self.precision = precision
+        weighted = precision.times(heard)
+        self._far_inverse = self.far_field.inverse(precision)
+        self._far_pull = self.far_field.pull(weighted)
+        by_far_field = self._far_pull * (self._far_inverse @ self._far_pull)
+        self._energy = self._bands(heard, weighted) - np.add.reduceat(by_far_field, starts)
+
+    def _explain(self) -> None:
+        """Fit the far field beside the components as they are, and see what is left."""
+        part, pull = self.evidence.table.part, self._far_pull
+        self.residual = self.evidence.heard.copy()
+        for component, coupling in zip(self.components, self._couplings(), strict=True):
+            self.residual -= self.sound(component)
+            pull = pull - component.strength[part] * coupling
+        self._far_heard = self.far_field.heard(self._far_inverse @ pull)
+        self.residual -= self._far_heard
+
+    def _couplings(self) -> FloatArray:
+        """Products of the components' weighted columns with those of the far field, (K, D)."""
+        told = [each.coupling for each in self.components if each.coupling is not None]
+        return np.array(told).reshape(len(self.components), len(self._far_pull))
+
     def _place(self, component: Component) -> None:
         """Paths and column of a component that has moved."""
         component.paths = sound_paths(
@@ -303,33 +343,36 @@ class SparseFit:
     def _fit_strengths(self) -> None:
         from scipy.optimize import nnls
 
-        evidence, count = self.evidence, len(self.components)
-        self.residual = evidence.heard.copy()
+        count, bands = len(self.components), self.evidence.sub_bands
         if count == 0:
-            self.gram = np.zeros((evidence.sub_bands, 0, 0))
-            self._product = np.zeros((evidence.sub_bands, 0))
+            self.gram, self._product = np.zeros((bands, 0, 0)), np.zeros((bands, 0))
+            self._explain()
             return
         columns = np.stack([component.column for component in self.components])
         self.gram, self._product = self._products(columns, self.weighted_columns())
-        strengths = np.zeros((count, evidence.sub_bands))
+        strengths = np.zeros((count, bands))
         for band, (gram, product) in enumerate(zip(self.gram, self._product, strict=True)):
             root, scale = _scaled_root(gram)
             solved, _ = nnls(root.T, np.linalg.solve(root, product * scale))
             strengths[:, band] = solved * scale
         for component, strength in zip(self.components, strengths, strict=True):
             component.strength = strength
-            self.residual -= self.sound(component)
+        self._explain()
 
     def _products(self, columns: Single, weighted: Single) -> tuple[FloatArray, FloatArray]:
         """Gram matrices (B, K, K) of columns, and their products (B, K) with what was heard."""
         starts, heard = self.evidence.table.starts, self.evidence.heard
+        couplings = self._couplings()
+        held = couplings @ self._far_inverse
         grams, products = [], []
         for start, stop in pairwise(starts):
             right = weighted[:, :, start:stop].reshape(len(columns), -1)
             left = columns[:, :, start:stop].reshape(len(columns), -1)
             gram = (right @ left.T).astype(np.float64)
+            gram -= held[:, start:stop] @ couplings[:, start:stop].T
             grams.append(0.5 * (gram + gram.T))
-            products.append((right @ heard[:, start:stop].ravel()).astype(np.float64))
+            product = (right @ heard[:, start:stop].ravel()).astype(np.float64)
+            products.append(product - held[:, start:stop] @ self._far_pull[start:stop])
         return np.array(grams), np.array(products)
 
     def _misfit(self, kept: list[int]) -> float:
@@ -368,18 +411,32 @@ class SparseFit:
         count, components, bands = len(owners), len(self.components), len(self.gram)
         hessian = np.zeros((count + bands * components,) * 2)
         gradient = np.zeros(len(hessian))
+        coupling = np.zeros((count, len(self._far_pull)))
 
-        def of_some(scans: slice) -> tuple[Single, Single, FloatArray]:
+        def of_some(scans: slice) -> tuple[Single, Single, FloatArray, FloatArray]:
             own = np.stack(list(self._derivatives(owners, scans)))
             weighted = self.precision.times(own, scans)
             flat = weighted.reshape(count, -1)
             squares = flat @ own.reshape(count, -1).T
-            return squares, flat @ self.residual[scans].ravel(), self._across(weighted, scans)
+            pull = flat @ self.residual[scans].ravel()
+            return (
+                squares,
+                pull,
+                self._across(weighted, scans),
+                self.far_field.pull(weighted, scans),
+            )
 
-        for squares, pull, across in side_by_side(of_some, parts(len(self.evidence))):
+        for squares, pull, across, far in side_by_side(of_some, parts(len(self.evidence))):
             hessian[:count, :count] += squares
             gradient[:count] += pull
             hessian[:count, count:] += across
+            coupling += far
+        held = coupling @ self._far_inverse
+        hessian[:count, :count] -= held @ coupling.T
+        couplings = self._couplings()
+        for band, (start, stop) in enumerate(pairwise(self.evidence.table.starts)):
+            place = slice(count + band * components, count + (band + 1) * components)
+            hessian[:count, place] -= held[:, start:stop] @ couplings[:, start:stop].T
         hessian[count:, :count] = hessian[:count, count:].T
         for band, gram in enumerate(self.gram):
             place = slice(count + band * components, count + (band + 1) * components)

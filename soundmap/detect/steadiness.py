@@ -39,7 +39,7 @@ def steadiness(fit: SparseFit, stretch: NDArray[np.int64]) -> FloatArray:
     """
     stretches = int(stretch.max()) + 1
     strengths = np.array([component.strength for component in fit.components])
-    pulls = fit.weighted_columns() * fit.residual
+    pulls = fit.pulls()
     total = np.zeros(len(pulls))
     pulled = np.zeros((len(pulls), stretches))
     edges = pairwise(fit.evidence.table.starts)

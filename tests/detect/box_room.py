@@ -47,8 +47,11 @@ def response(toward, aperture=1.0):
     return total / 40
 
 
-def observed(emitters, *, ambient=1.0, seed=1, speed_m_s=0.3):
-    """Audio scans, laser ranges, way and array; emitters are x, y and power at 1 m."""
+def observed(emitters, *, ambient=1.0, far=(), seed=1, speed_m_s=0.3):
+    """Audio scans, laser ranges, way and array.
+
+    Emitters are x, y and power at 1 m; far are bearings of the map and the power from there.
+    """
     rng = np.random.default_rng(seed)
     track = way(speed_m_s)
     time_ns = track.time_ns[2:-2:2]
@@ -64,6 +67,8 @@ def observed(emitters, *, ambient=1.0, seed=1, speed_m_s=0.3):
             down = 2.0 * MOUNT.translation_m[2]  # the image below a floor that absorbs half
             aperture = np.sqrt(square / (square + down**2))
             heard += 0.5 * strength / (square + down**2) * response(toward, aperture)
+        for bearing, strength in far:
+            heard += strength * response(bearing - turn)
         power.append(heard * (1.0 + 0.02 * rng.standard_normal((4, 120))))
         ray = 2.0 * np.pi * np.arange(360) / 360 + turn
         with np.errstate(divide="ignore"):

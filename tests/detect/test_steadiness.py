@@ -13,13 +13,13 @@ def fitted(columns, heard):
     flat = columns.reshape(len(columns), -1)
     gram = flat @ flat.T
     strength = np.linalg.solve(gram, flat @ heard.ravel())
+    residual = heard - np.einsum("k,ksd->sd", strength, columns)
     return SimpleNamespace(
         components=[
             SimpleNamespace(column=column, strength=np.array([each]))
             for column, each in zip(columns, strength, strict=True)
         ],
-        residual=heard - np.einsum("k,ksd->sd", strength, columns),
-        weighted_columns=lambda: columns,  # all noise alike
+        pulls=lambda: columns * residual,  # all noise alike, no far field
         gram=gram[None],
         evidence=SimpleNamespace(table=SimpleNamespace(starts=STARTS)),
     )

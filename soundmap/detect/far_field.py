@@ -1,0 +1,142 @@
+r"""Far field: what comes from the same bearings of the map wherever the robot stands.
+
+Reverberation that has long forgotten its source, a hall behind an open door, traffic: such sound
+has no place, but it is not the same from all sides either. Its power over the bearings of the map
+has harmonics f, unknown ones, in each sub-band, and scan s hears
+
+.. math:: A_s f = w_s \, T \, R(\alpha_s) \, f,
+
+R turning them into the array's axes, T being the array's response and w one over the noise. A fit
+of the components' strengths q beside it has the normal equations
+
+.. math:: \begin{pmatrix} G & C \\ C^T & F \end{pmatrix} \begin{pmatrix} q \\ f \end{pmatrix} =
+          \begin{pmatrix} b \\ a \end{pmatrix}, \quad
+          F = \sum_s A_s^T \Sigma_s^{-1} A_s + \lambda I,
+
+from which f is taken out: :math:`(G - C F^{-1} C^T) q = b - C F^{-1} a`. Held to nought by
+:math:`\lambda`, the far field leaves to the components what either could explain.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from soundmap.detect.evidence import Evidence
+from soundmap.detect.harmonics import Single
+from soundmap.detect.model_errors import Precision, parts
+from soundmap.geometry import FloatArray
+from soundmap.side_by_side import side_by_side
+
+USUAL = 1.0
+"""Standard deviation of what the far field adds to a scan, over that of the noise."""
+
+
+class FarField:
+    """The far field's part in the normal equations of a fit.
+
+    Parameters
+    ----------
+    evidence : Evidence
+    """
+
+    def __init__(self, evidence: Evidence) -> None:
+        self.starts = evidence.table.starts
+        self._bands = [
+            _Turning(evidence, band, slice(start, stop))
+            for band, (start, stop) in enumerate(pairwise(self.starts))
+        ]
+
+    def inverse(self, precision: Precision) -> FloatArray:
+        r"""Inverse of :math:`F`, shape (D, D)."""
+        inverse = np.zeros((int(self.starts[-1]),) * 2)
+        for own, turning, weights in zip(
+            pairwise(self.starts), self._bands, precision.inverse, strict=True
+        ):
+
+            def squares(
+                scans: slice, turning: _Turning = turning, weights: Single = weights
+            ) -> Single:
+                columns = turning.columns(scans)
+                weighted = np.matmul(weights[scans], columns)
+                return columns.reshape(-1, columns.shape[2]).T @ weighted.reshape(
+                    -1, columns.shape[2]
+                )
+
+            normal = np.eye(own[1] - own[0]) * (turning.usual_square / USUAL**2)
+            for square in side_by_side(squares, parts(len(weights))):
+                normal += square
+            inverse[slice(*own), slice(*own)] = np.linalg.inv(normal)
+        return inverse
+
+    def pull(self, weighted: Single, scans: slice = slice(None)) -> FloatArray:
+        r""":math:`\sum_s A_s^T` times columns (..., s, D) of some scans, shape (..., D)."""
+        bands = zip(self._bands, pairwise(self.starts), strict=True)
+        return np.concatenate(
+            [turning.pull(weighted[..., slice(*own)], scans) for turning, own in bands], axis=-1
+        ).astype(np.float64)
+
+    def pulls(self, weighted: Single) -> Single:
+        r""":math:`A_s^T` times a column (S, D), scan by scan, shape (S, D)."""
+        bands = zip(self._bands, pairwise(self.starts), strict=True)
+        return np.concatenate(
+            [turning.pulls(weighted[:, slice(*own)]) for turning, own in bands], 1
+        )
+
+    def heard(self, field: FloatArray) -> Single:
+        """What a far field (D,) adds to each scan, shape (S, D)."""
+        bands = zip(self._bands, pairwise(self.starts), strict=True)
+        single = field.astype(np.float32)
+        return np.hstack([turning.heard(single[slice(*own)]) for turning, own in bands])
+
+
+class _Turning:
+    """Response of the array to a far field of a sub-band, turned as it stood in each scan."""
+
+    def __init__(self, evidence: Evidence, band: int, own: slice) -> None:
+        table = evidence.table
+        beams = table.beams[0, :, own].astype(np.float64)
+        number = np.arange(1, beams.shape[1] // 2 + 1)
+        phase = 2.0 * np.pi / table.waves * np.arange(table.waves)[:, None] * number
+        by_cos, by_sin = beams.T @ np.cos(phase), beams.T @ np.sin(phase)
+        size = np.sqrt(0.5 * np.sum(by_cos**2 + by_sin**2, axis=0))
+        self._by_cos = (by_cos / size).astype(np.float32)
+        self._by_sin = (by_sin / size * evidence.handedness).astype(np.float32)
+        smeared = (1.0 + 2.0 * np.cos(evidence.turn_rad[:, None] * number / np.sqrt(8.0))) / 3.0
+        smeared *= evidence.weight[:, band : band + 1]
+        turn = evidence.axis_rad[:, None] * number
+        self._cos = (smeared * np.cos(turn)).astype(np.float32)
+        self._sin = (smeared * np.sin(turn)).astype(np.float32)
+        self.usual_square = float(np.mean(evidence.weight[:, band] ** 2))
+
+    def columns(self, scans: slice) -> Single:
+        """What each harmonic adds to each scan, shape (s, d, d)."""
+        cos, sin = self._cos[scans, None], self._sin[scans, None]
+        return np.concatenate(
+            [self._by_cos * cos - self._by_sin * sin, self._by_cos * sin + self._by_sin * cos],
+            axis=2,
+        )
+
+    def pull(self, weighted: Single, scans: slice) -> Single:
+        """Sum of the columns' products with others (..., s, d), shape (..., d)."""
+        cos, sin = self._cos[scans], self._sin[scans]
+        even, odd = weighted @ self._by_cos, weighted @ self._by_sin
+        return np.concatenate(
+            [
+                np.einsum("sh,...sh->...h", cos, even) - np.einsum("sh,...sh->...h", sin, odd),
+                np.einsum("sh,...sh->...h", sin, even) + np.einsum("sh,...sh->...h", cos, odd),
+            ],
+            axis=-1,
+        )
+
+    def pulls(self, weighted: Single) -> Single:
+        """The columns' products with another (S, d), scan by scan, shape (S, d)."""
+        even, odd = weighted @ self._by_cos, weighted @ self._by_sin
+        return np.hstack([self._cos * even - self._sin * odd, self._sin * even + self._cos * odd])
+
+    def heard(self, field: Single) -> Single:
+        """What a field (d,) adds to each scan, shape (S, d)."""
+        cos, sin = np.split(field, 2)
+        even, odd = self._cos * cos + self._sin * sin, self._cos * sin - self._sin * cos
+        return even @ self._by_cos.T + odd @ self._by_sin.T
