@@ -36,6 +36,8 @@ from soundmap.sensors import MicArray
 from soundmap.sound import AudioScans, Source, SourceFit, SourceList
 
 LEAST_SCANS = 8
+LEAST_EFFECTIVE_SCANS = 5.0
+"""A source is heard by at least so many scans (effective number)."""
 LEAST_NOISE = 0.5
 """What is explained counts in units of what is left, but of no less than this of the noise."""
 ONE_SOURCE_M = 0.45
@@ -120,7 +122,7 @@ def _found(
         _source(fit, each, stretch)
         for each in _strongest_apart(told)
         if each.probability <= rate
-        and effective_number(each.component.paths.gain[Path.DIRECT]) >= LEAST_SCANS
+        and effective_number(each.component.paths.gain[Path.DIRECT]) >= LEAST_EFFECTIVE_SCANS
         and _reach_m(each.placement) <= VAGUE_M
         and region.owns(each.placement.place_m)
     ]

@@ -10,7 +10,7 @@ from soundmap.detect.walls import HIT_CELL_M
 from soundmap.geometry import FloatArray
 from soundmap.grid import OccupancyGrid
 
-SPREAD = 10.0
+SPREAD = 6.0
 """Variance of places over what the noise alone would make: bearings of neighbouring scans err
 together, and so do those of all scans of one source by its reflections."""
 LEAST_SIGMA_M = 0.012

