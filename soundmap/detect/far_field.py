@@ -51,23 +51,9 @@ class FarField:
     def inverse(self, precision: Precision) -> FloatArray:
         r"""Inverse of :math:`F`, shape (D, D)."""
         inverse = np.zeros((int(self.starts[-1]),) * 2)
-        for own, turning, weights in zip(
-            pairwise(self.starts), self._bands, precision.inverse, strict=True
-        ):
-
-            def squares(
-                scans: slice, turning: _Turning = turning, weights: Single = weights
-            ) -> Single:
-                columns = turning.columns(scans)
-                weighted = np.matmul(weights[scans], columns)
-                return columns.reshape(-1, columns.shape[2]).T @ weighted.reshape(
-                    -1, columns.shape[2]
-                )
-
-            normal = np.eye(own[1] - own[0]) * (turning.usual_square / USUAL**2)
-            for square in side_by_side(squares, parts(len(weights))):
-                normal += square
-            inverse[slice(*own), slice(*own)] = np.linalg.inv(normal)
+        bands = zip(self._bands, pairwise(self.starts), precision.inverse, strict=True)
+        for turning, own, weights in bands:
+            inverse[slice(*own), slice(*own)] = np.linalg.inv(turning.normal(weights))
         return inverse
 
     def pull(self, weighted: Single, scans: slice = slice(None)) -> FloatArray:
@@ -100,7 +86,7 @@ class _Turning:
         number = np.arange(1, beams.shape[1] // 2 + 1)
         phase = 2.0 * np.pi / table.waves * np.arange(table.waves)[:, None] * number
         by_cos, by_sin = beams.T @ np.cos(phase), beams.T @ np.sin(phase)
-        size = np.sqrt(0.5 * np.sum(by_cos**2 + by_sin**2, axis=0))
+        size = np.sqrt(0.5 * np.sum(by_cos**2 + by_sin**2, axis=0)) + 1e-12
         self._by_cos = (by_cos / size).astype(np.float32)
         self._by_sin = (by_sin / size * evidence.handedness).astype(np.float32)
         smeared = (1.0 + 2.0 * np.cos(evidence.turn_rad[:, None] * number / np.sqrt(8.0))) / 3.0
@@ -108,10 +94,23 @@ class _Turning:
         turn = evidence.axis_rad[:, None] * number
         self._cos = (smeared * np.cos(turn)).astype(np.float32)
         self._sin = (smeared * np.sin(turn)).astype(np.float32)
-        self.usual_square = float(np.mean(evidence.weight[:, band] ** 2))
+        self._held = float(np.mean(evidence.weight[:, band] ** 2)) / USUAL**2
 
-    def columns(self, scans: slice) -> Single:
-        """What each harmonic adds to each scan, shape (s, d, d)."""
+    def normal(self, weights: Single) -> FloatArray:
+        r""":math:`\sum_s A_s^T \Sigma_s^{-1} A_s + \lambda I`, weights (S, d, d), shape (d, d)."""
+
+        def of_some(scans: slice) -> Single:
+            columns = self._columns(scans)
+            weighted = np.matmul(weights[scans], columns)
+            return columns.reshape(-1, columns.shape[2]).T @ weighted.reshape(-1, columns.shape[2])
+
+        normal = self._held * np.eye(weights.shape[1])
+        for square in side_by_side(of_some, parts(len(weights))):
+            normal += square
+        return normal
+
+    def _columns(self, scans: slice) -> Single:
+        """What each harmonic adds to some scans, shape (s, d, d)."""
         cos, sin = self._cos[scans, None], self._sin[scans, None]
         return np.concatenate(
             [self._by_cos * cos - self._by_sin * sin, self._by_cos * sin + self._by_sin * cos],

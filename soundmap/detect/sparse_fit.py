@@ -180,6 +180,9 @@ class SparseFit:
 
     def renew(self) -> None:
         """Model errors as of the present strengths, and strengths as of these errors."""
+        for component in self.components:
+            component.weighted = component.weighted_by = component.coupling = None
+        del self.precision  # it is large: the next one takes its room
         self._weigh(Precision(self.evidence, self.components, self._far_heard))
         self.refit()
 
