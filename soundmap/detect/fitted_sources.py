@@ -45,6 +45,7 @@ ONE_SOURCE_M = 0.45
 VAGUE_M = 0.5
 """A source is somewhere: within so much of where it is reported [m], with 95 %."""
 STRETCH_M = 0.5
+"""Bearings err much the same way for half a metre on end."""
 ONE_SIDE_RAD = np.radians(40.0)
 LOUD_SIDE = 0.75
 """Share of all that is told of a source that makes it no louder than along its axis."""
@@ -117,7 +118,7 @@ def _found(
     if not fit.components:
         return [], []
     stretch = _stretches(evidence)
-    told = _told(fit, stretch, surface, surface_odds(surface, room))
+    told = _told(fit, _squares(evidence), surface, surface_odds(surface, room))
     sources = [
         _source(fit, each, stretch)
         for each in _strongest_apart(told)
@@ -137,18 +138,23 @@ def _found(
 
 
 def _told(
-    fit: SparseFit, stretch: NDArray[np.int64], surface_m: FloatArray, odds: FloatArray
+    fit: SparseFit, square: NDArray[np.int64], surface_m: FloatArray, odds: FloatArray
 ) -> list[_Told]:
     """All components with what speaks for them, those that explain most first."""
     components = fit.components
     places = [
-        placement(component.place_m, covariance, surface_m, odds)
+        placement(
+            component.place_m,
+            covariance * _erring_alike(component, square),
+            surface_m,
+            odds,
+        )
         for component, covariance in zip(components, fit.covariances(), strict=True)
     ]
     noise = max(fit.noise, LEAST_NOISE)
     marks = Marks(
         gain=np.array([fit.gain(index) / noise for index in range(len(components))]),
-        steadiness=steadiness(fit, stretch),
+        steadiness=steadiness(fit, square),
         surface_odds=np.array([place.surface_odds for place in places]),
         behind_m=np.array([_behind_m(component) for component in components]),
     )
@@ -213,6 +219,23 @@ def _source(fit: SparseFit, told: _Told, stretch: NDArray[np.int64]) -> Source:
     )
     visits = int(fit.evidence.merged[heard].sum())
     return Source(float(place[0]), float(place[1]), power, visits, details)
+
+
+def _squares(evidence: Evidence) -> NDArray[np.int64]:
+    """Number of the square of the floor that each scan was taken in.
+
+    What the model does not know errs alike in all scans of a square, lap for lap.
+    """
+    cell = np.floor(evidence.place_m / STRETCH_M)
+    return np.unique(cell, axis=0, return_inverse=True)[1].ravel().astype(np.int64)
+
+
+def _erring_alike(component: Component, square: NDArray[np.int64]) -> float:
+    """How many scans err alike: of those that tell of a component, so many a square."""
+    told = component.paths.gain[Path.DIRECT] ** 2
+    if not told.any():
+        return 1.0
+    return float(np.sum(np.bincount(square, told) ** 2) / np.sum(told**2))
 
 
 def _stretches(evidence: Evidence) -> NDArray[np.int64]:

@@ -10,9 +10,6 @@ from soundmap.detect.walls import HIT_CELL_M
 from soundmap.geometry import FloatArray
 from soundmap.grid import OccupancyGrid
 
-SPREAD = 6.0
-"""Variance of places over what the noise alone would make: bearings of neighbouring scans err
-together, and so do those of all scans of one source by its reflections."""
 LEAST_SIGMA_M = 0.012
 """Standard deviation of a place from poses and cells, however well it is heard."""
 NEAR_M = 0.5
@@ -68,7 +65,7 @@ def placement(
     place_m : ndarray, shape (2,)
         From the bearings [m].
     covariance_m2 : ndarray, shape (2, 2)
-        As the noise alone would make it [m^2].
+        Of that place [m^2].
     surface_m : ndarray, shape (H, 2)
         Points of surfaces, one for each `HIT_CELL_M` of them [m].
     odds : ndarray, shape (H,)
@@ -77,11 +74,11 @@ def placement(
     Examples
     --------
     >>> wall = np.column_stack([np.full(50, 2.0), 0.04 * np.arange(50)])
-    >>> along_x = np.diag([0.03, 0.004]) ** 2
+    >>> along_x = np.diag([0.1, 0.01]) ** 2
     >>> placement(np.array([1.9, 1.0]), along_x, wall, np.full(50, 9.0)).place_m.round(2).tolist()
     [2.0, 1.0]
     """
-    open_covariance = SPREAD * covariance_m2 + LEAST_SIGMA_M**2 * np.eye(2)
+    open_covariance = covariance_m2 + LEAST_SIGMA_M**2 * np.eye(2)
     step = surface_m - place_m
     near = np.hypot(*step.T) < NEAR_M
     step = step[near]

@@ -25,13 +25,13 @@ import numpy as np
 from soundmap.geometry import FloatArray
 
 USUAL_GAIN = 100.0
-AT_THESE = -1.9
+AT_THESE = -1.98
 """Log odds of the loudest component if it explains that, is not steady at all and as likely on a
 surface as not."""
-PER_GAIN, PER_SHARE, PER_STEADINESS = 0.9, 0.76, 0.30
+PER_GAIN, PER_SHARE, PER_STEADINESS = 0.84, 0.75, 0.32
 MOST_STEADINESS = 20.0
 """To be steadier tells no more."""
-PER_SURFACE_ODDS, LEAST_ODDS = 0.53, 0.05
+PER_SURFACE_ODDS, LEAST_ODDS = 0.51, 0.05
 """Less likely to be on a surface than this is the same."""
 PER_METRE_BEHIND, MOST_BEHIND_M = -43.0, 0.05
 """To lie farther behind tells no more."""
@@ -83,7 +83,7 @@ def false_alarm_probabilities(marks: Marks) -> FloatArray:
     >>> ghost = Marks(*np.array([[400.0], [4.0], [0.1], [0.1]]))
     >>> source = Marks(*np.array([[400.0], [10.0], [1.0], [0.0]]))
     >>> false_alarm_probabilities(ghost).round(3), false_alarm_probabilities(source).round(4)
-    (array([0.914]), array([0.0023]))
+    (array([0.965]), array([0.0022]))
     """
     exponent = np.clip(-GHOST_DECAY * log_odds(marks), -700.0, 700.0)
     return np.asarray(np.minimum(GHOST_RATE * np.exp(exponent), 1.0))

@@ -4,7 +4,7 @@ import pytest
 from soundmap.detect.placement import placement
 
 WALL = np.column_stack([np.full(100, 2.0), 0.04 * np.arange(100)])
-ALONG_X = np.diag([0.03**2, 0.004**2])
+ALONG_X = np.diag([0.095**2, 0.013**2])
 
 
 def placed(x, odds):
