@@ -10,7 +10,7 @@ from soundmap.detect.walls import HIT_CELL_M
 from soundmap.geometry import FloatArray
 from soundmap.grid import OccupancyGrid
 
-LEAST_SIGMA_M = 0.012
+LEAST_SIGMA_M = 0.008
 """Standard deviation of a place from poses and cells, however well it is heard."""
 NEAR_M = 0.5
 WALL_M = 0.10
@@ -21,7 +21,7 @@ what the map does not show, of walls, and if there is no telling the two apart."
 LEAST_OFF_MAP, LEAST_OFF_MAP_SHARE = 5, 0.005
 """A map of walls alone leaves some of what lasers see off it; one that was built on the way does
 not."""
-SURFACE_SIGMA_M = 0.02
+SURFACE_SIGMA_M = 0.01
 """Of the distance between a source and the surface that it is on."""
 
 
