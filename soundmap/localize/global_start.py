@@ -184,9 +184,9 @@ class _Search:
         offset = steps * np.array([step_m, step_m, step_m / self._lever_m])
         around = (pose[:, None, :] + offset).reshape(-1, 3)
         score = _pose_scores(self._sharp, *self._place_of, around, self._points)
-        score = score.reshape(len(pose), -1)
+        score = score.reshape(len(pose), len(steps))
         best = np.argmax(score, axis=1)
-        chosen = around.reshape(len(pose), -1, 3)[np.arange(len(pose)), best]
+        chosen = around.reshape(len(pose), len(steps), 3)[np.arange(len(pose)), best]
         chosen[:, 2] = wrapped_angle(chosen[:, 2])
         return chosen, score.max(axis=1)
 
