@@ -66,9 +66,7 @@ class FarField:
     def pulls(self, weighted: Single) -> Single:
         r""":math:`A_s^T` times a column (S, D), scan by scan, shape (S, D)."""
         bands = zip(self._bands, pairwise(self.starts), strict=True)
-        return np.concatenate(
-            [turning.pulls(weighted[:, slice(*own)]) for turning, own in bands], 1
-        )
+        return np.hstack([turning.pulls(weighted[:, slice(*own)]) for turning, own in bands])
 
     def heard(self, field: FloatArray) -> Single:
         """What a far field (D,) adds to each scan, shape (S, D)."""

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from soundmap.config import DetectConfig, ScanConfig
 from soundmap.detect.candidates import candidate_places
+from soundmap.detect.component import Component
 from soundmap.detect.evidence import Evidence, gathered_evidence
 from soundmap.detect.growth import grown_fit
 from soundmap.detect.harmonics import Single
@@ -27,7 +28,7 @@ from soundmap.detect.reflections import is_at_mirror, told_reflections
 from soundmap.detect.regions import Region, regions
 from soundmap.detect.significance import Marks, false_alarm_probabilities
 from soundmap.detect.sound_paths import Kind, Path
-from soundmap.detect.sparse_fit import Component, SparseFit
+from soundmap.detect.sparse_fit import SparseFit
 from soundmap.detect.steadiness import steadiness
 from soundmap.detect.walls import surface_points, wall_lines
 from soundmap.geometry import CHI_SQUARED_95, FloatArray, Trajectory

@@ -7,6 +7,7 @@ import copy
 import numpy as np
 
 from soundmap.detect.candidates import Candidates, best_candidates
+from soundmap.detect.component import Component
 from soundmap.detect.evidence import Evidence
 from soundmap.detect.matched_filter import (
     HEIGHTS_M,
@@ -17,7 +18,7 @@ from soundmap.detect.matched_filter import (
 )
 from soundmap.detect.relocation import relocate
 from soundmap.detect.sound_paths import Kind, Path
-from soundmap.detect.sparse_fit import Component, SparseFit
+from soundmap.detect.sparse_fit import SparseFit
 from soundmap.geometry import FloatArray
 
 LEAST_GAIN = 100.0
@@ -161,7 +162,8 @@ def _merge(fit: SparseFit) -> None:
         for _ in range(STEPS):
             fit.move([joint])
         away = float(np.hypot(*(first.place_m - second.place_m)))
-        if away > SURELY_ONE_M and fit.misfit - before > may_lose:
+        is_worse = away > SURELY_ONE_M and fit.misfit - before > may_lose
+        if is_worse or joint not in fit.components:
             fit.components = kept
             fit.refit()
 

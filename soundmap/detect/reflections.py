@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from soundmap.detect.component import Component
 from soundmap.detect.evidence import Evidence
 from soundmap.detect.sound_paths import Path
-from soundmap.detect.sparse_fit import Component
 from soundmap.geometry import FloatArray
 from soundmap.sound import Reflection, Source
 

@@ -13,6 +13,7 @@ import copy
 import numpy as np
 
 from soundmap.detect.candidates import Candidates, finer_place
+from soundmap.detect.component import Component
 from soundmap.detect.harmonics import Single
 from soundmap.detect.matched_filter import (
     HEIGHTS_M,
@@ -22,7 +23,7 @@ from soundmap.detect.matched_filter import (
     explained,
 )
 from soundmap.detect.sound_paths import Kind
-from soundmap.detect.sparse_fit import Component, SparseFit
+from soundmap.detect.sparse_fit import SparseFit
 from soundmap.geometry import FloatArray
 
 WITHIN_M = 2.5

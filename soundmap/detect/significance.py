@@ -11,7 +11,7 @@ are linear in its steadiness, in the logarithms of what it explains, alone and o
 component, and of the odds that it is on a surface, and in how far it lies behind what the lasers
 see. The weights are those of a logistic regression on 1299 components, 494 of them sources, of 168
 simulated runs in random rooms. The share of runs with a ghost of at least some s was measured on
-them, too, with weights from other runs than the one looked at:
+them, too, with weights from other runs than the one looked at; it stays below
 
 .. math:: P(s) = 0.04 \, e^{-1.2 s}.
 """

@@ -13,18 +13,17 @@ distance, and would pull them off.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from enum import IntEnum
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from soundmap.detect.component import ASSUMED, SHARE_SIGMA, Component, Share
 from soundmap.detect.evidence import Evidence
 from soundmap.detect.far_field import FarField
 from soundmap.detect.harmonics import Single
 from soundmap.detect.model_errors import Precision, bearing_derivative, parts
-from soundmap.detect.sound_paths import NEAREST_M, Kind, Path, Paths, sound_paths, waves_heard
+from soundmap.detect.sound_paths import NEAREST_M, Kind, Path, sound_paths, waves_heard
 from soundmap.geometry import FloatArray
 from soundmap.side_by_side import side_by_side
 
@@ -37,61 +36,6 @@ HOLD = 100.0
 MAY_BE_BEHIND_M, HOLD_BEHIND = 0.03, 3000.0
 """A source farther behind a surface than this [m] is drawn back to it so firmly [1/m^2]: what the
 lasers see hides what lies behind, and reflections in the wall pull sources into it."""
-
-
-class Share(IntEnum):
-    """Ways besides the direct one whose part of a component's power is fitted."""
-
-    CLOSE_WALLS = 2
-    ROOM = 3
-    """All other walls and the floor."""
-    HIDDEN = 4
-    """Through surfaces in the way."""
-
-
-ASSUMED = {Share.CLOSE_WALLS: 0.5, Share.ROOM: 0.5, Share.HIDDEN: 0.2}
-"""Shares as long as the scans do not tell them. Walls reflect half; none passes a wall, but much a
-table whose edge or legs the lasers see."""
-SHARE_SIGMA = {Share.CLOSE_WALLS: 0.08, Share.ROOM: 0.03, Share.HIDDEN: 0.04}
-"""How firmly shares are held to what is assumed of them."""
-
-
-@dataclass(eq=False)
-class Component:
-    """One sound of the fit.
-
-    Attributes
-    ----------
-    place_m : ndarray, shape (2,)
-    height_m : float
-        Above or below the array [m].
-    kind : Kind
-    shares : dict
-        For each `Share` the part of its power that takes such a way.
-    strength : ndarray, shape (B,)
-        Mean square at 1 m in each sub-band.
-    paths : Paths
-    column : ndarray of float32, shape (S, D)
-        What it adds at strength 1.
-    ways : dict
-        For each `Share` those paths that have it and that any scan hears.
-    weighted : ndarray of float32, shape (S, D), optional
-        Its column times the precision that is `weighted_by`; kept since refits are many.
-    coupling : ndarray, shape (D,), optional
-        Products of that with the columns of the far field.
-    """
-
-    place_m: FloatArray
-    height_m: float
-    kind: Kind
-    shares: dict[Share, float]
-    strength: FloatArray
-    paths: Paths
-    column: Single
-    ways: dict[Share, list[int]] = field(default_factory=dict)
-    weighted: Single | None = None
-    weighted_by: Precision | None = None
-    coupling: FloatArray | None = None
 
 
 class SparseFit:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
 
 import numpy as np
 from numba import njit
@@ -73,14 +72,6 @@ class SurroundingsGatherer:
             for scanner in sorted(nearest)
         ]
         self._packer.add(time_ns, thinned(np.concatenate(points), DIRECTIONS))
-
-
-def gathered_surroundings(lasers: Iterable[LaserScan], odometry: Trajectory) -> Surroundings:
-    """The surroundings of a whole run."""
-    gatherer = SurroundingsGatherer(odometry)
-    for scan in lasers:
-        gatherer.see(scan)
-    return gatherer.gathered()
 
 
 @njit(cache=True, nogil=True)

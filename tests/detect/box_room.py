@@ -47,7 +47,7 @@ def response(toward, aperture=1.0):
     return total / 40
 
 
-def observed(emitters, *, ambient=1.0, far=(), seed=1, speed_m_s=0.3):
+def observed(emitters, *, ambient=1.0, above_m=0.0, far=(), seed=1, speed_m_s=0.3):
     """Audio scans, laser ranges, way and array.
 
     Emitters are x, y and power at 1 m; far are bearings of the map and the power from there.
@@ -63,8 +63,9 @@ def observed(emitters, *, ambient=1.0, far=(), seed=1, speed_m_s=0.3):
         for x, y, strength in emitters:
             step = np.array([x, y]) - place
             toward, square = np.arctan2(step[1], step[0]) - turn, step @ step
-            heard += strength / square * response(toward)
-            down = 2.0 * MOUNT.translation_m[2]  # the image below a floor that absorbs half
+            direct = square + above_m**2
+            heard += strength / direct * response(toward, np.sqrt(square / direct))
+            down = 2.0 * MOUNT.translation_m[2] + above_m  # below a floor that absorbs half
             aperture = np.sqrt(square / (square + down**2))
             heard += 0.5 * strength / (square + down**2) * response(toward, aperture)
         for bearing, strength in far:

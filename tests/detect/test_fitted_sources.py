@@ -1,10 +1,12 @@
 """The fit of sources to scans from a rectangular room."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from soundmap.config import DetectConfig, ScanConfig
-from soundmap.detect.fitted_sources import _loud_side, fitted_sources
+from soundmap.detect.fitted_sources import _erring_alike, _loud_side, _squares, fitted_sources
 from tests.detect.box_room import observed
 
 
@@ -56,3 +58,19 @@ def test_from_nearly_one_place_no_source_in_the_open_is_told():
     hanging = [(3.5, 3.2, 20.0)]
     assert len(run(hanging)) == 1
     assert len(run(hanging, speed_m_s=0.01)) == 0
+
+
+def test_scans_of_half_a_metre_err_alike_lap_for_lap():
+    lap = np.column_stack([0.1 * np.arange(50), np.full(50, 0.2)])
+    once, twice = (_squares(SimpleNamespace(place_m=np.tile(lap, (n, 1)))) for n in (1, 2))
+    assert np.array_equal(once, np.repeat(np.arange(10), 5))
+    assert np.array_equal(twice, np.tile(once, 2))
+    heard = SimpleNamespace(paths=SimpleNamespace(gain=np.ones((1, 50))))
+    assert _erring_alike(heard, once) == pytest.approx(5.0)
+    again = SimpleNamespace(paths=SimpleNamespace(gain=np.ones((1, 100))))
+    assert _erring_alike(again, twice) == pytest.approx(10.0)
+
+
+def test_a_source_high_above_the_array_is_found():
+    (source,) = run([(5.0, 3.1, 20.0)], above_m=1.2)
+    np.testing.assert_allclose((source.x_m, source.y_m), (5.0, 3.1), atol=0.1)

@@ -48,6 +48,12 @@ def test_even_odds_are_as_probable_as_was_measured():
     np.testing.assert_allclose(false_alarm_probabilities(even), GHOST_RATE, rtol=1e-6)
 
 
+def test_to_lie_far_behind_a_surface_tells_no_more_than_to_lie_clearly_behind_it():
+    behind = [dataclasses.replace(USUAL, behind_m=np.array([each])) for each in (0.02, 0.05, 0.5)]
+    little, clearly, far = (float(log_odds(marks)[0]) for marks in behind)
+    assert little > clearly == far
+
+
 def test_probabilities_stay_between_0_and_1():
     extreme = Marks(
         gain=np.array([0.0, 1e-3, 1e9]),

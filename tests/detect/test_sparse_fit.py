@@ -1,9 +1,13 @@
+from itertools import pairwise
+
 import numpy as np
 import pytest
+from scipy.optimize import nnls
 
 from soundmap.config import ScanConfig
 from soundmap.detect import sparse_fit
 from soundmap.detect.evidence import gathered_evidence
+from soundmap.detect.far_field import USUAL
 from soundmap.detect.sound_paths import Kind
 from soundmap.detect.sparse_fit import SparseFit
 from soundmap.detect.walls import surface_points, wall_lines
@@ -41,3 +45,38 @@ def test_a_component_that_no_scan_hears_goes():
     fit.add(np.array([40.0, 40.0]), 0.3, Kind.IMAGE)
     fit.refit()
     assert [component.place_m[0] for component in fit.components] == pytest.approx([5.5])
+
+
+def test_the_misfit_is_that_of_sources_and_far_field_fitted_together():
+    far = [(0.3, 0.8), (1.9, 0.5), (4.4, 0.7)]
+    evidence = gathered_evidence(*observed([(5.5, 3.1, 20.0)], far=far), ScanConfig())
+    fit = SparseFit(evidence, wall_lines(surface_points(evidence)))
+    components = [fit.add(np.array(place), 0.3, Kind.SOURCE) for place in [(5.5, 3.1), (2.0, 4.8)]]
+    fit.refit()
+    misfit = 0.0
+    for band, (start, stop) in enumerate(pairwise(evidence.table.starts)):
+        heard = evidence.heard[:, start:stop].ravel().astype(np.float64)
+        unit = np.eye(int(evidence.table.starts[-1]))[start:stop]
+        field = np.stack([fit.far_field.heard(each)[:, start:stop].ravel() for each in unit], -1)
+        held = np.sqrt(np.mean(evidence.weight[:, band] ** 2)) / USUAL
+        places = np.stack([each.column[:, start:stop].ravel() for each in components], -1)
+        # Strengths are not negative, harmonics are of either sign, and held to nought.
+        columns = np.hstack([places, field, -field])
+        hold = held * np.eye(stop - start)
+        full = np.vstack([columns, np.hstack([np.zeros((stop - start, 2)), hold, -hold])])
+        solved, left = nnls(full, np.concatenate([heard, np.zeros(stop - start)]), maxiter=5000)
+        misfit += left**2
+        for component, strength in zip(components, solved[:2], strict=True):
+            assert component.strength[band] == pytest.approx(strength, rel=1e-2, abs=1e-3)
+    assert fit.misfit == pytest.approx(misfit, rel=1e-3)
+
+
+def test_a_step_that_the_far_field_could_explain_leads_to_the_same_place():
+    far = [(0.3, 0.8), (1.9, 0.5), (4.4, 0.7)]
+    evidence = gathered_evidence(*observed([(5.5, 3.1, 4.0)], far=far), ScanConfig())
+    fit = SparseFit(evidence, wall_lines(surface_points(evidence)))
+    component = fit.add(np.array([5.35, 3.25]), 0.3, Kind.SOURCE)
+    fit.renew()
+    for _ in range(8):
+        fit.move()
+    np.testing.assert_allclose(component.place_m, (5.5, 3.1), atol=0.05)

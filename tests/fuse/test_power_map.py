@@ -5,11 +5,11 @@ import worlds
 from soundmap.config import FuseConfig
 from soundmap.fuse.accumulate import PowerAccumulator
 from soundmap.fuse.power_map import fused_scans, power_map_frame
-from soundmap.fuse.surroundings import gathered_surroundings
 from soundmap.geometry import Mount, Trajectory, transformed
 from soundmap.grid import GridFrame
 from soundmap.losses import LossLedger
 from soundmap.sound import AudioScans, LevelReference
+from tests.fuse.gathered import gathered_surroundings
 
 TRUTH = worlds.driven([(1.0, 1.0), (5.0, 1.0), (5.0, 2.2)])
 SCANS = worlds.laser_scans(TRUTH, [worlds.FRONT, worlds.BACK], beams=721)

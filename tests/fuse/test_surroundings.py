@@ -8,11 +8,11 @@ import worlds
 from soundmap.fuse.surroundings import (
     DIRECTIONS,
     SurroundingsGatherer,
-    gathered_surroundings,
     thinned,
 )
 from soundmap.geometry import Trajectory, transformed
 from soundmap.surroundings import BLOCK, SurroundingsPacker
+from tests.fuse.gathered import gathered_surroundings
 
 TRUTH = worlds.driven([(1.0, 1.0), (5.0, 1.0), (5.0, 2.2)])
 SCANS = worlds.laser_scans(TRUTH, [worlds.FRONT, worlds.BACK], beams=721)

@@ -1,0 +1,66 @@
+"""Component: one sound of the sparse fit, and the ways it takes to the array."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+from soundmap.detect.harmonics import Single
+from soundmap.detect.model_errors import Precision
+from soundmap.detect.sound_paths import Kind, Paths
+from soundmap.geometry import FloatArray
+
+
+class Share(IntEnum):
+    """Ways besides the direct one whose part of a component's power is fitted."""
+
+    CLOSE_WALLS = 2
+    ROOM = 3
+    """All other walls and the floor."""
+    HIDDEN = 4
+    """Through surfaces in the way."""
+
+
+ASSUMED = {Share.CLOSE_WALLS: 0.5, Share.ROOM: 0.5, Share.HIDDEN: 0.2}
+"""Shares as long as the scans do not tell them. Walls reflect half; none passes a wall, but much a
+table whose edge or legs the lasers see."""
+SHARE_SIGMA = {Share.CLOSE_WALLS: 0.08, Share.ROOM: 0.03, Share.HIDDEN: 0.04}
+"""How firmly shares are held to what is assumed of them."""
+
+
+@dataclass(eq=False)
+class Component:
+    """One sound of the fit.
+
+    Attributes
+    ----------
+    place_m : ndarray, shape (2,)
+    height_m : float
+        Above or below the array [m].
+    kind : Kind
+    shares : dict
+        For each `Share` the part of its power that takes such a way.
+    strength : ndarray, shape (B,)
+        Mean square at 1 m in each sub-band.
+    paths : Paths
+    column : ndarray of float32, shape (S, D)
+        What it adds at strength 1.
+    ways : dict
+        For each `Share` those paths that have it and that any scan hears.
+    weighted : ndarray of float32, shape (S, D), optional
+        Its column times the precision that is `weighted_by`; kept since refits are many.
+    coupling : ndarray, shape (D,), optional
+        Products of that with the columns of the far field.
+    """
+
+    place_m: FloatArray
+    height_m: float
+    kind: Kind
+    shares: dict[Share, float]
+    strength: FloatArray
+    paths: Paths
+    column: Single
+    ways: dict[Share, list[int]] = field(default_factory=dict)
+    weighted: Single | None = None
+    weighted_by: Precision | None = None
+    coupling: FloatArray | None = None
