@@ -8,6 +8,7 @@ from soundmap.config import ScanConfig
 from soundmap.detect import sparse_fit
 from soundmap.detect.evidence import gathered_evidence
 from soundmap.detect.far_field import USUAL
+from soundmap.detect.model_errors import Precision
 from soundmap.detect.sound_paths import Kind
 from soundmap.detect.sparse_fit import SparseFit
 from soundmap.detect.walls import surface_points, wall_lines
@@ -80,3 +81,53 @@ def test_a_step_that_the_far_field_could_explain_leads_to_the_same_place():
     for _ in range(8):
         fit.move()
     np.testing.assert_allclose(component.place_m, (5.5, 3.1), atol=0.05)
+
+
+@pytest.fixture(scope="module")
+def before_far_field():
+    far = [(0.3, 0.8), (1.9, 0.5), (4.4, 0.7)]
+    evidence = gathered_evidence(*observed([(5.5, 3.1, 20.0)], far=far), ScanConfig())
+    fit = SparseFit(evidence, wall_lines(surface_points(evidence)))
+    fit.add(np.array([5.4, 3.0]), 0.3, Kind.SOURCE)
+    fit.refit()
+    return fit
+
+
+def test_what_the_far_field_could_be_does_not_pull_at_strengths(before_far_field):
+    fit, rng = before_far_field, np.random.default_rng(3)
+    kept = fit.residual
+    fit.residual = fit.far_field.heard(rng.standard_normal(int(fit.evidence.table.starts[-1])))
+    pull, alone = fit.pulls().sum(), (fit.weighted_columns() * fit.residual).sum()
+    fit.residual = kept
+    assert abs(pull) < 0.1 * abs(alone)
+
+
+def test_what_the_far_field_adds_to_a_scan_is_known_less_well_than_anything_else(before_far_field):
+    fit = before_far_field
+    loud = 10.0 * fit.far_field.heard(np.ones(int(fit.evidence.table.starts[-1])))
+    without, with_it = (Precision(fit.evidence, fit.components, far) for far in (None, loud))
+    assert np.sum(loud * with_it.times(loud)) < 0.5 * np.sum(loud * without.times(loud))
+
+
+def test_the_far_field_is_taken_out_of_the_equations_of_places(before_far_field):
+    fit = before_far_field
+    hessian, _, owners = fit._system(fit.components)
+    count, starts = len(owners), fit.evidence.table.starts
+    own = np.stack(list(fit._derivatives(owners, slice(None)))).astype(np.float64)
+    column = fit.components[0].column.astype(np.float64)
+    size = int(starts[-1])
+    far = np.stack([fit.far_field.heard(unit) for unit in np.eye(size)]).astype(np.float64)
+    inverse = fit.far_field.inverse(fit.precision)
+    coupling = np.einsum("ksd,fsd->kf", own, far)
+    squares = np.einsum("ksd,lsd->kl", own, own) - coupling @ inverse @ coupling.T
+    scale = np.sqrt(np.diag(squares))
+    held = (hessian[:count, :count] - squares) / np.outer(scale, scale)
+    assert np.abs(held - np.diag(np.diag(held))).max() < 1e-3  # places and shares are held
+    own_far = np.einsum("sd,fsd->f", column, far)
+    for band, (start, stop) in enumerate(pairwise(starts)):
+        across = np.einsum("ksd,sd->k", own[:, :, start:stop], column[:, start:stop])
+        part = slice(start, stop)
+        across = across - coupling[:, part] @ inverse[part, part] @ own_far[part]
+        size_of = scale * np.linalg.norm(column[:, part])
+        np.testing.assert_allclose(hessian[:count, count + band] / size_of, across / size_of,
+                                   atol=2e-4)  # fmt: skip

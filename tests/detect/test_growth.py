@@ -1,0 +1,37 @@
+import numpy as np
+
+from soundmap.config import ScanConfig
+from soundmap.detect import growth
+from soundmap.detect.evidence import gathered_evidence
+from soundmap.detect.matched_filter import HEIGHTS_M, explained, matched_scans
+from soundmap.detect.sound_paths import Kind
+from soundmap.detect.sparse_fit import SparseFit
+from soundmap.detect.walls import surface_points, wall_lines
+from tests.detect.box_room import observed
+
+
+def left_of_two(apart_m, monkeypatch):
+    """Components that are left of two sources if joining them may cost nothing."""
+    monkeypatch.setattr(growth, "MERGE_SHARE", 0.0)
+    monkeypatch.setattr(growth, "JOINT_SHARE", 0.0)
+    places = [(5.5, 3.1), (5.5, 3.1 + apart_m)]
+    evidence = gathered_evidence(*observed([(*place, 20.0) for place in places]), ScanConfig())
+    fit = SparseFit(evidence, wall_lines(surface_points(evidence)))
+    for place in places:
+        fit.add(np.array(place), 0.3, Kind.SOURCE)
+    fit.renew()
+    growth._merge(fit)
+    return len(fit.components)
+
+
+def test_components_a_hand_apart_are_one_and_others_only_if_that_costs_little(monkeypatch):
+    assert left_of_two(0.2, monkeypatch) == 1
+    assert left_of_two(0.6, monkeypatch) == 2
+
+
+def test_a_high_source_explains_most_at_the_greatest_height():
+    evidence = gathered_evidence(*observed([(5.0, 3.1, 20.0)], above_m=1.2), ScanConfig())
+    fit = SparseFit(evidence, np.zeros((0, 3)))
+    matched = matched_scans(evidence, evidence.heard, fit.precision)
+    (value,) = explained(evidence, matched, np.array([[5.0, 3.1]]), Kind.SOURCE)
+    assert HEIGHTS_M[int(np.argmax(value))] > 1.0
