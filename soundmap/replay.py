@@ -13,9 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soundmap.calibrate.calibration import array_offsets
+from soundmap.calibrate.joining import joined_offsets
 from soundmap.config import Config, ScanConfig
-from soundmap.detect.evidence import ranged_scans
+from soundmap.detect.evidence import Evidence, gathered_evidence, ranged_scans, velocities
 from soundmap.detect.fitted_sources import fitted_sources
+from soundmap.detect.offset_fit import offsets_by_fit
 from soundmap.detect.place_levels import with_level_errors
 from soundmap.detect.source_list import detect_sources
 from soundmap.errors import ConfigError, NothingUsableError
@@ -24,7 +26,7 @@ from soundmap.fuse.bearing_range import ranges_around
 from soundmap.fuse.fitted_map import fitted_power_map, mapped_scans
 from soundmap.fuse.power_map import fused_scans, level_reference, power_map_frame
 from soundmap.fuse.surroundings import SurroundingsGatherer
-from soundmap.geometry import Trajectory
+from soundmap.geometry import FloatArray, Trajectory
 from soundmap.grid import GridFrame, OccupancyGrid
 from soundmap.localize.trajectory import localized
 from soundmap.localize.views import ViewChooser
@@ -42,7 +44,7 @@ from soundmap.scan.audio_scan import audio_scans, kept_scans
 from soundmap.scan.spectrum import band_bins
 from soundmap.sensors import ArrayOffsets, AudioBlock, LaserScan, MicArray
 from soundmap.sound import AudioScans, PowerMap, SourceList
-from soundmap.surroundings import NO_SURROUNDINGS
+from soundmap.surroundings import NO_SURROUNDINGS, Surroundings
 
 MOST_THREADS = 4
 """Threads that turn sound into audio scans; they keep up with any reading of the log."""
@@ -91,7 +93,9 @@ def process(
     measured, from_cache = _kept_or_measured(log_path, given, config, start_pose, cache, clock)
     room, trajectory, losses = measured.room, measured.trajectory, LossLedger()
     with clock.stage("calibrate"):
-        measured, offsets = _calibrated(measured, config)
+        by_peaks = offsets_by_peaks(measured.scans, trajectory, measured.array, config)
+        measured = replace(measured, scans=replace(measured.scans, sharp=None))
+        measured, offsets = _calibrated(measured, by_peaks, config)
     scans = measured.scans
     if heard is not None:
         heard(scans, trajectory)
@@ -128,18 +132,81 @@ def process(
     )
 
 
-def _calibrated(measured: Measured, config: Config) -> tuple[Measured, ArrayOffsets | None]:
+def _calibrated(
+    measured: Measured, by_peaks: ArrayOffsets | None, config: Config
+) -> tuple[Measured, ArrayOffsets | None]:
     """The same with clock and yaw corrected where they are clearly off, and by how much."""
-    scans, array = measured.scans, measured.array
-    if scans.sharp is None:
+    if by_peaks is None:
         return measured, None
-    found = array_offsets(
-        scans.sharp, scans.time_ns, measured.trajectory, array, config.scan, config.calibrate
-    )
+    scans, array = measured.scans, measured.array
+    where = measured.surroundings, measured.trajectory, array
+    found = refined_offsets(by_peaks, scans, *where, config)
     mount = array.mount.turned(found.yaw.correction)
     time_ns = scans.time_ns + round(found.clock.correction * 1e9)
-    scans = replace(scans, time_ns=time_ns, mount=mount, sharp=None)
+    scans = replace(scans, time_ns=time_ns, mount=mount)
     return replace(measured, scans=scans, array=replace(array, mount=mount)), found
+
+
+def offsets_by_peaks(
+    scans: AudioScans, trajectory: Trajectory, array: MicArray, config: Config
+) -> ArrayOffsets | None:
+    """What the array's clock and yaw lack, by the bearings of peaks alone.
+
+    Parameters
+    ----------
+    scans : AudioScans
+        Without sharp power the array is not asked about.
+    trajectory : Trajectory
+    array : MicArray
+        With its mount as believed.
+    config : Config
+    """
+    if scans.sharp is None:
+        return None
+    return array_offsets(
+        scans.sharp, scans.time_ns, trajectory, array, config.scan, config.calibrate
+    )
+
+
+def refined_offsets(
+    by_peaks: ArrayOffsets,
+    scans: AudioScans,
+    surroundings: Surroundings,
+    trajectory: Trajectory,
+    array: MicArray,
+    config: Config,
+) -> ArrayOffsets:
+    """The same by the sparse fit to all that was heard, from where the peaks have them.
+
+    Parameters
+    ----------
+    by_peaks : ArrayOffsets
+    scans : AudioScans
+    surroundings : Surroundings
+    trajectory : Trajectory
+    array : MicArray
+        With its mount as believed.
+    config : Config
+    """
+    start = np.array([by_peaks.clock.value, by_peaks.yaw.value])
+    if not np.isfinite(start).all():
+        return by_peaks
+    scan = config.scan
+
+    def heard_at(clock_s: float, yaw_rad: float) -> tuple[Evidence, FloatArray]:
+        turned = replace(array, mount=array.mount.turned(yaw_rad))
+        stamped = replace(scans, time_ns=scans.time_ns + round(clock_s * 1e9))
+        wanted = ranged_scans(stamped, trajectory, turned, scan)
+        around = ranges_around(surroundings, trajectory, stamped.time_ns, turned.mount, wanted)
+        evidence = gathered_evidence(stamped, around, trajectory, turned, scan)
+        return evidence, velocities(stamped, trajectory, turned, scan)
+
+    give_back()
+    by_fit = offsets_by_fit(start, heard_at)
+    if by_fit is None:
+        return by_peaks
+    bearings = scans.power.shape[1]
+    return joined_offsets(by_peaks, by_fit, array, scan, config.calibrate, bearings=bearings)
 
 
 def _fused(measured: Measured, config: Config, losses: LossLedger) -> tuple[PowerMap, int]:

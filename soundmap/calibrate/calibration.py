@@ -24,9 +24,10 @@ from soundmap.calibrate.far_field import (
 )
 from soundmap.calibrate.peaks import Peaks, beam_blur, clear_peaks
 from soundmap.calibrate.search import ballot, fixed_places, starting_points
+from soundmap.calibrate.verdict import judged
 from soundmap.calibrate.way import Way, WayAt, array_way, moved_apart
 from soundmap.config import CalibrateConfig, ScanConfig
-from soundmap.geometry import FloatArray, Trajectory
+from soundmap.geometry import Trajectory
 from soundmap.sensors import ArrayOffsets, MicArray, Offset, OffsetVerdict
 from soundmap.side_by_side import side_by_side
 
@@ -50,9 +51,6 @@ UNCONFIRMED = np.array([0.006, 0.0])
 """... and of the clock where bearings alone tell it: a place may be pulled all through a turn."""
 YAW_ALONE = np.array([0.0, 1.0])
 """The yaw rests on where the places are, and one that is wrong may pull it; the clock on turns."""
-USEFUL = np.array([0.015, np.radians(1.5)])
-"""Results less certain than this, as a standard deviation, are of no use [s, rad]."""
-CLEAR_SIGMAS = 3.5
 
 
 def array_offsets(
@@ -122,7 +120,9 @@ def array_offsets(
     mixed = final.spread * YAW_ALONE
     sigma = np.sqrt(np.diag(final.covariance) + systematic**2 + doubt**2 + mixed**2)
     sigma[0] *= max(1.0, _disagreement(final, far))
-    return _judged(final, sigma, correct=calibrate.mode == "correct")
+    places = sum(len(stretch.place_m) for stretch in final.stretches)
+    correct = calibrate.mode == "correct"
+    return judged(final.state, sigma, final.explained, places, correct=correct)
 
 
 def _without_far_fields(
@@ -195,25 +195,6 @@ def _stretches(way: Way) -> list[tuple[int, int]]:
     spans = [(int(a), int(b)) for a, b in pairwise(ends) if b > a]
     chosen = np.linspace(0, len(spans) - 1, min(len(spans), MOST_STRETCHES)).round().astype(int)
     return [spans[index] for index in chosen]
-
-
-def _judged(fit: BearingFit, sigma: FloatArray, *, correct: bool) -> ArrayOffsets:
-    clock, yaw = (
-        _offset(float(value), float(spread), float(useful), correct=correct)
-        for value, spread, useful in zip(fit.state, sigma, USEFUL, strict=True)
-    )
-    uncertain = OffsetVerdict.UNKNOWN in (clock.verdict, yaw.verdict)
-    why = "turns and sources along the way leave it too uncertain" if uncertain else ""
-    places = sum(len(stretch.place_m) for stretch in fit.stretches)
-    return ArrayOffsets(clock, yaw, fit.explained, places, why)
-
-
-def _offset(value: float, sigma: float, useful: float, *, correct: bool) -> Offset:
-    if sigma > useful:
-        return Offset(value, sigma, OffsetVerdict.UNKNOWN)
-    if abs(value) <= CLEAR_SIGMAS * sigma:
-        return Offset(value, sigma, OffsetVerdict.NOUGHT)
-    return Offset(value, sigma, OffsetVerdict.CORRECTED if correct else OffsetVerdict.CLEAR)
 
 
 def _nothing(why: str, explained: float = 0.0) -> ArrayOffsets:

@@ -33,6 +33,7 @@ LOUDNESS_SCANS = 7
 that chance or interference makes loud would count less, and all levels would come out low."""
 SCANS_AT_ONCE = 4000
 MOST_TURN_RAD = np.radians(12.0)
+VELOCITY_STEP_NS = 25_000_000
 
 
 @dataclass(frozen=True)
@@ -165,6 +166,33 @@ def ranged_scans(
     return stands.scan[_firsts(stands.group)[0]]
 
 
+def velocities(
+    scans: AudioScans, trajectory: Trajectory, array: MicArray, config: ScanConfig
+) -> FloatArray:
+    """How fast the array moved at each scan of `gathered_evidence`.
+
+    Returns
+    -------
+    ndarray, shape (S, 3)
+        Velocity in the map frame [m/s] and turn rate [rad/s], means over merged scans.
+    """
+    stands = _stands(scans, trajectory, array, config)
+    time_ns = scans.time_ns[stands.scan]
+    before, after = (
+        _placed(trajectory.at(time_ns + side * VELOCITY_STEP_NS), array) for side in (-1, 1)
+    )
+    step = after - before
+    step[:, 2] = wrapped_angle(step[:, 2])
+    rate = np.nan_to_num(step / (2e-9 * VELOCITY_STEP_NS))
+    return _means(rate, stands.group, _firsts(stands.group)[1])
+
+
+def _placed(base: FloatArray, array: MicArray) -> FloatArray:
+    """Place of the array and direction of its x axis, shape (T, 3), for poses of the base."""
+    offset = np.broadcast_to(array.mount.translation_m[:2], (len(base), 2))
+    return np.column_stack([transformed(base, offset), base[:, 2] + array.mount.yaw_rad])
+
+
 @dataclass(frozen=True)
 class _Stands:
     """The T scans to be used: index, pose of the array, turn during the scan, and group.
@@ -197,10 +225,8 @@ def _stands(
         for start in range(0, max(len(scans), 1), SCANS_AT_ONCE)
     ]
     chosen, base, turn = (np.concatenate(each) for each in zip(*some, strict=True))
-    heading = base[:, 2]
-    mount = array.mount
-    place = transformed(base, np.broadcast_to(mount.translation_m[:2], (len(base), 2)))
-    axis = np.asarray(wrapped_angle(heading + mount.yaw_rad))
+    placed = _placed(base, array)
+    place, axis = placed[:, :2], np.asarray(wrapped_angle(placed[:, 2]))
     group = _rests(place, axis)
     if len(group) and group[-1] >= LONG_RUN_SCANS:
         kept = _seldom_seen(place, axis, group)

@@ -44,7 +44,7 @@ class FarField:
     def __init__(self, evidence: Evidence) -> None:
         self.starts = evidence.table.starts
         self._bands = [
-            _Turning(evidence, band, slice(start, stop))
+            FarFieldBand(evidence, band, slice(start, stop))
             for band, (start, stop) in enumerate(pairwise(self.starts))
         ]
 
@@ -74,13 +74,37 @@ class FarField:
         single = field.astype(np.float32)
         return np.hstack([turning.heard(single[slice(*own)]) for turning, own in bands])
 
+    def turned(self, field: FloatArray) -> Single:
+        """Change of what a far field (D,) adds with the array's direction, shape (S, D) [1/rad]."""
+        change = np.empty_like(field)
+        for start, stop in pairwise(self.starts):
+            cos, sin = np.split(field[start:stop], 2)
+            number = np.arange(1, len(cos) + 1)
+            change[start:stop] = np.concatenate([number * sin, -number * cos])
+        return self.heard(change)
 
-class _Turning:
-    """Response of the array to a far field of a sub-band, turned as it stood in each scan."""
 
-    def __init__(self, evidence: Evidence, band: int, own: slice) -> None:
+class FarFieldBand:
+    """Response of the array to a far field of a sub-band, turned as it stood in each scan.
+
+    Parameters
+    ----------
+    evidence : Evidence
+    band : int
+    own : slice
+        The sub-band's part of D.
+    aperture : int
+        Number of the aperture that the waves have, of `APERTURES`.
+
+    Attributes
+    ----------
+    held : float
+        How firmly each harmonic is held to nought.
+    """
+
+    def __init__(self, evidence: Evidence, band: int, own: slice, aperture: int = 0) -> None:
         table = evidence.table
-        beams = table.beams[0, :, own].astype(np.float64)
+        beams = table.beams[aperture, :, own].astype(np.float64)
         number = np.arange(1, beams.shape[1] // 2 + 1)
         phase = 2.0 * np.pi / table.waves * np.arange(table.waves)[:, None] * number
         by_cos, by_sin = beams.T @ np.cos(phase), beams.T @ np.sin(phase)
@@ -92,22 +116,22 @@ class _Turning:
         turn = evidence.axis_rad[:, None] * number
         self._cos = (smeared * np.cos(turn)).astype(np.float32)
         self._sin = (smeared * np.sin(turn)).astype(np.float32)
-        self._held = float(np.mean(evidence.weight[:, band] ** 2)) / USUAL**2
+        self.held = float(np.mean(evidence.weight[:, band] ** 2)) / USUAL**2
 
     def normal(self, weights: Single) -> FloatArray:
         r""":math:`\sum_s A_s^T \Sigma_s^{-1} A_s + \lambda I`, weights (S, d, d), shape (d, d)."""
 
         def of_some(scans: slice) -> Single:
-            columns = self._columns(scans)
+            columns = self.columns(scans)
             weighted = np.matmul(weights[scans], columns)
             return columns.reshape(-1, columns.shape[2]).T @ weighted.reshape(-1, columns.shape[2])
 
-        normal = self._held * np.eye(weights.shape[1])
+        normal = self.held * np.eye(weights.shape[1])
         for square in side_by_side(of_some, parts(len(weights))):
             normal += square
         return normal
 
-    def _columns(self, scans: slice) -> Single:
+    def columns(self, scans: slice) -> Single:
         """What each harmonic adds to some scans, shape (s, d, d)."""
         cos, sin = self._cos[scans, None], self._sin[scans, None]
         return np.concatenate(

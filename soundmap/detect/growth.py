@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -54,12 +55,10 @@ def grown_fit(evidence: Evidence, walls: FloatArray, candidates: Candidates) -> 
     walls : ndarray, shape (W, 3)
     candidates : Candidates
     """
-    stride = max(round(len(evidence) / GROWTH_SCANS), 1)
-    few = evidence if stride == 1 else evidence.chosen(np.arange(0, len(evidence), stride))
-    fit = _grown(few, walls, candidates, LEAST_GAIN / stride)
+    fit = rough_fit(evidence, walls, candidates)
     relocate(fit, candidates)
-    if stride > 1:
-        fit = _with_all_scans(fit, evidence)
+    if len(fit.evidence) < len(evidence):
+        fit = carried_fit(fit.components, walls, evidence)
     _merge(fit)
     fit.renew()
     _bring_into_view(fit)
@@ -73,10 +72,23 @@ def grown_fit(evidence: Evidence, walls: FloatArray, candidates: Candidates) -> 
     return fit
 
 
-def _grown(
-    evidence: Evidence, walls: FloatArray, candidates: Candidates, least_gain: float
+def rough_fit(
+    evidence: Evidence, walls: FloatArray, candidates: Candidates, *, least_gain: float = LEAST_GAIN
 ) -> SparseFit:
-    """Components added until no candidate explains as much as the least gain."""
+    """Components added until no candidate explains so much, to about `GROWTH_SCANS` of the scans.
+
+    Parameters
+    ----------
+    evidence : Evidence
+    walls : ndarray, shape (W, 3)
+    candidates : Candidates
+    least_gain : float
+        As `LEAST_GAIN`, for all scans.
+    """
+    stride = max(round(len(evidence) / GROWTH_SCANS), 1)
+    if stride > 1:
+        evidence = evidence.chosen(np.arange(0, len(evidence), stride))
+        least_gain /= stride
     fit = SparseFit(evidence, walls)
     fit.refit()
     for _ in range(MOST_ROUNDS):
@@ -104,10 +116,12 @@ def _grown(
     return fit
 
 
-def _with_all_scans(grown: SparseFit, evidence: Evidence) -> SparseFit:
-    """The fit of some scans' components to all scans."""
-    fit = SparseFit(evidence, grown.walls)
-    for component in grown.components:
+def carried_fit(
+    components: Sequence[Component], walls: FloatArray, evidence: Evidence
+) -> SparseFit:
+    """The components of a fit, fitted to other scans of the same sounds."""
+    fit = SparseFit(evidence, walls)
+    for component in components:
         joined = fit.add(component.place_m, component.height_m, component.kind)
         joined.strength = component.strength
         joined.shares.update(component.shares)

@@ -9,11 +9,17 @@ the covariance
 .. math:: \Sigma = I + \sum u u^T,
 
 and what a weak source adds counts only as far as no error of a loud one could have added it.
+
+A component's harmonics may also err one by one, each by a share of its own size: sound that
+interferes with its own reflections is off in each of them by chance, not in all of them as if its
+bearing were bent. This adds :math:`\kappa^2 |a|^2` to the diagonal, a being what the component
+adds to the scan.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import chain, pairwise
 from typing import Protocol
 
@@ -27,12 +33,12 @@ from soundmap.side_by_side import side_by_side
 
 STRENGTH_ERROR = 0.35
 """Standard deviation of a source's strength in one scan, over its mean strength."""
-BEARING_ERROR = 0.2
-"""Of its bearing, over half the width of the beam: most of it is interference."""
 APERTURE_ERROR = 0.03
 """Of the cosine of its elevation."""
 REFLECTION_ERROR = 0.35
 """Of the share of power that walls and the floor reflect."""
+REFLECTED = 0.5
+"""What a wall reflects of a component's sound, as far as errors of its harmonics go."""
 HIDDEN_ERROR = 0.35
 """Of the share that passes a surface in the way."""
 FAR_FIELD_ERROR = 0.35
@@ -40,6 +46,26 @@ FAR_FIELD_ERROR = 0.35
 LEAST_MODE = 0.05
 """A mode whose energy stays below this in all scans changes nothing."""
 SCANS_AT_ONCE = 128
+
+
+@dataclass(frozen=True)
+class ComponentErrors:
+    """How a component's direct sound errs in one scan.
+
+    Attributes
+    ----------
+    bearing : float
+        Standard deviation of its bearing, over half the width of the beam: most of it is
+        interference.
+    harmonic : float
+        Of each harmonic of it and of its reflections by walls, over its size.
+    """
+
+    bearing: float = 0.2
+    harmonic: float = 0.0
+
+
+USUAL_ERRORS = ComponentErrors()
 
 
 class Sounding(Protocol):
@@ -58,6 +84,7 @@ class Precision:
     components : sequence of Sounding
     far_field : ndarray of float32, shape (S, D), optional
         What the far field adds to the scans.
+    errors : ComponentErrors, optional
 
     Attributes
     ----------
@@ -70,6 +97,7 @@ class Precision:
         evidence: Evidence,
         components: Sequence[Sounding],
         far_field: Single | None = None,
+        errors: ComponentErrors = USUAL_ERRORS,
     ) -> None:
         starts = evidence.table.starts
         self.starts = starts
@@ -85,15 +113,16 @@ class Precision:
 
         def invert(scans: slice) -> None:
             loud: list[list[Single]] = [[] for _ in self.inverse]  # what is quiet goes at once
-            modes = [_modes(evidence, each, scans) for each in components]
+            modes = [_modes(evidence, each, scans, errors.bearing) for each in components]
             if far_field is not None:
                 modes.append(iter([np.float32(FAR_FIELD_ERROR) * far_field[scans]]))
             for mode in chain.from_iterable(modes):
                 for kept, own in zip(loud, bands, strict=True):
                     if _is_loud(mode[:, own]):
                         kept.append(mode[:, own].copy())
-            for kept, inverse in zip(loud, self.inverse, strict=True):
-                inverse[scans] = _inverse(kept, inverse.shape[1])
+            alone = _alone(evidence, components, scans, errors.harmonic)
+            for kept, inverse, own in zip(loud, self.inverse, bands, strict=True):
+                inverse[scans] = _inverse(kept, inverse.shape[1], alone[:, own])
 
         side_by_side(invert, parts(len(evidence)))
 
@@ -122,25 +151,60 @@ def _is_loud(mode: Single) -> bool:
     return bool(np.einsum("sd,sd->s", mode, mode).max() > LEAST_MODE)
 
 
-def _inverse(modes: list[Single], size: int) -> Single:
-    """Inverse of the identity plus the squares of all modes, each (S, d); it takes them away."""
-    if not modes:
+def _alone(
+    evidence: Evidence, components: Sequence[Sounding], scans: slice, share: float
+) -> Single:
+    """Variance of errors of single harmonics, shape (s, D), or (1, D) where there are none.
+
+    Real and imaginary part of a harmonic have the same.
+    """
+    part = evidence.table.part
+    variance = np.zeros((len(evidence.place_m[scans]) if share else 1, len(part)), dtype=np.float32)
+    if not share:
+        return variance
+    for component in components:
+        paths, strength = component.paths, share * component.strength[part].astype(np.float32)
+        for path in (Path.DIRECT, *range(Path.WALLS, len(paths.gain))):
+            gain = paths.gain[path, scans]
+            if gain.any():
+                wave, aperture = paths.wave[path, scans], paths.aperture[path, scans]
+                heard = waves_heard(evidence, wave, aperture, gain, scans) * strength
+                reflected = 1.0 if path == Path.DIRECT else REFLECTED
+                variance += (np.float32(reflected) * heard) ** 2
+    for start, stop in pairwise(evidence.table.starts):
+        real, imaginary = np.split(variance[:, start:stop], 2, axis=1)
+        mean = 0.5 * (real + imaginary)
+        variance[:, start:stop] = np.hstack([mean, mean])
+    return variance
+
+
+def _inverse(modes: list[Single], size: int, alone: Single) -> Single:
+    """Inverse of the identity plus the squares of all modes, each (S, d); it takes them away.
+
+    Harmonics that err alone add their variance (S, d), or (1, d) if it is nought everywhere.
+    """
+    if not modes and len(alone) == 1:
         return np.eye(size, dtype=np.float32)[None]
-    stacked = np.stack(modes, axis=1)
-    modes.clear()
-    covariance = np.matmul(stacked.transpose(0, 2, 1), stacked)
-    del stacked
-    covariance[:, np.arange(size), np.arange(size)] += 1.0
+    if modes:
+        stacked = np.stack(modes, axis=1)
+        modes.clear()
+        covariance = np.matmul(stacked.transpose(0, 2, 1), stacked)
+        del stacked
+    else:
+        covariance = np.zeros((len(alone), size, size), dtype=np.float32)
+    covariance[:, np.arange(size), np.arange(size)] += 1.0 + alone
     return np.asarray(np.linalg.inv(covariance), dtype=np.float32)
 
 
-def _modes(evidence: Evidence, component: Sounding, scans: slice) -> Iterator[Single]:
+def _modes(
+    evidence: Evidence, component: Sounding, scans: slice, bearing_error: float
+) -> Iterator[Single]:
     """Modes of one component in some scans, each (S, D)."""
     if not component.strength.any():
         return
     part = evidence.table.part
     strength = component.strength[part].astype(np.float32)
-    bearing = (BEARING_ERROR * evidence.table.width_rad)[part].astype(np.float32)
+    bearing = (bearing_error * evidence.table.width_rad)[part].astype(np.float32)
     paths = component.paths
     wave, gain = paths.wave[:, scans], paths.gain[:, scans]
     aperture = paths.aperture[:, scans]

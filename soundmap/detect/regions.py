@@ -65,13 +65,13 @@ def regions(evidence: Evidence) -> Iterator[Region]:
         for row in range(count[1]):
             corner = np.array([edges[0][column], edges[1][row]])
             opposite = np.array([edges[0][column + 1], edges[1][row + 1]])
-            scans = _telling(evidence, corner, opposite)
+            scans = telling(evidence, corner, opposite)
             if len(scans):
                 yield Region(corner, opposite, evidence.chosen(scans))
 
 
-def _telling(evidence: Evidence, low_m: FloatArray, high_m: FloatArray) -> NDArray[np.int64]:
-    """Scans in a rectangle or near it."""
+def telling(evidence: Evidence, low_m: FloatArray, high_m: FloatArray) -> NDArray[np.int64]:
+    """Scans in a rectangle or near it, shape (K,)."""
     inside = (evidence.place_m > low_m - MARGIN_M) & (evidence.place_m < high_m + MARGIN_M)
     scans = np.flatnonzero(inside.all(axis=1))
     return scans[:: -(-len(scans) // MOST_IN_REGION) or 1]

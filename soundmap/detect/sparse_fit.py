@@ -48,6 +48,10 @@ class SparseFit:
     components : list of Component
     residual : ndarray of float32, shape (S, D)
     precision : Precision
+    far_harmonics : ndarray, shape (D,)
+        Of the far field, as fitted.
+    far_heard : ndarray of float32, shape (S, D), or None
+        What it adds to the scans; None before the first fit.
     gram : ndarray, shape (B, K, K)
         Products of the components' columns with each other in each sub-band, in units of the noise.
     """
@@ -57,7 +61,8 @@ class SparseFit:
         self.components: list[Component] = []
         self.residual = evidence.heard
         self.far_field = FarField(evidence)
-        self._far_heard: Single | None = None
+        self.far_heard: Single | None = None
+        self.far_harmonics = np.zeros(int(evidence.table.starts[-1]))
         self._weigh(Precision(evidence, []))
         self.gram = np.zeros((evidence.sub_bands, 0, 0))
         self._product = np.zeros((evidence.sub_bands, 0))
@@ -127,7 +132,7 @@ class SparseFit:
         for component in self.components:
             component.weighted = component.weighted_by = component.coupling = None
         del self.precision  # it is large: the next one takes its room
-        self._weigh(Precision(self.evidence, self.components, self._far_heard))
+        self._weigh(Precision(self.evidence, self.components, self.far_heard))
         self.refit()
 
     def refit(self) -> None:
@@ -237,8 +242,9 @@ class SparseFit:
         for component, coupling in zip(self.components, self._couplings(), strict=True):
             self.residual -= self.sound(component)
             pull = pull - component.strength[part] * coupling
-        self._far_heard = self.far_field.heard(self._far_inverse @ pull)
-        self.residual -= self._far_heard
+        self.far_harmonics = self._far_inverse @ pull
+        self.far_heard = self.far_field.heard(self.far_harmonics)
+        self.residual -= self.far_heard
 
     def _couplings(self) -> FloatArray:
         """Products of the components' weighted columns with those of the far field, (K, D)."""
@@ -341,6 +347,14 @@ class SparseFit:
         """Of all components, shape (K, B)."""
         return np.array([component.strength for component in self.components])
 
+    def unknowns(self, chosen: list[Component]) -> list[tuple[Component, int]]:
+        """Places (axes 0, 1) and shares (as `Share`) of those components that enough scans hear."""
+        owners: list[tuple[Component, int]] = []
+        for component in chosen:
+            if np.count_nonzero(component.paths.gain[Path.DIRECT]) >= 3:
+                owners += [(component, axis) for axis in (0, 1, *component.ways)]
+        return owners
+
     def _system(
         self, chosen: list[Component]
     ) -> tuple[FloatArray, FloatArray, list[tuple[Component, int]]]:
@@ -349,10 +363,7 @@ class SparseFit:
         The strengths' own unknowns stand last, sub-band by sub-band; only the first ones have
         owners.
         """
-        owners: list[tuple[Component, int]] = []
-        for component in chosen:
-            if np.count_nonzero(component.paths.gain[Path.DIRECT]) >= 3:
-                owners += [(component, axis) for axis in (0, 1, *component.ways)]
+        owners = self.unknowns(chosen)
         if not owners:
             return np.zeros((0, 0)), np.zeros(0), owners
         count, components, bands = len(owners), len(self.components), len(self.gram)
@@ -361,7 +372,7 @@ class SparseFit:
         coupling = np.zeros((count, len(self._far_pull)))
 
         def of_some(scans: slice) -> tuple[Single, Single, FloatArray, FloatArray]:
-            own = np.stack(list(self._derivatives(owners, scans)))
+            own = np.stack(list(self.derivatives(owners, scans)))
             weighted = self.precision.times(own, scans)
             flat = weighted.reshape(count, -1)
             squares = flat @ own.reshape(count, -1).T
@@ -416,7 +427,7 @@ class SparseFit:
             hessian[own, own] += HOLD_BEHIND * np.outer(toward, toward)
             gradient[own] -= HOLD_BEHIND * behind * toward
 
-    def _derivatives(self, owners: list[tuple[Component, int]], scans: slice) -> Iterator[Single]:
+    def derivatives(self, owners: list[tuple[Component, int]], scans: slice) -> Iterator[Single]:
         """Change of what some scans hear with each unknown, each (s, D)."""
         evidence, part = self.evidence, self.evidence.table.part
         for component, axis in owners:

@@ -28,8 +28,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 from bench_accuracy import simulated
 
-from soundmap.calibrate.calibration import array_offsets
-from soundmap.config import CalibrateConfig, Config, loaded_config
+from soundmap.config import Config, loaded_config
 from soundmap.detect.fitted_sources import fitted_sources
 from soundmap.evaluate import read_tum
 from soundmap.fuse.bearing_range import ranges_around
@@ -40,6 +39,7 @@ from soundmap.grid import OccupancyGrid
 from soundmap.localize.trajectory import estimate_trajectory
 from soundmap.logs.robot_log import open_log
 from soundmap.map_file import read_map
+from soundmap.replay import offsets_by_peaks, refined_offsets
 from soundmap.scan.audio_scan import audio_scans, kept_scans
 from soundmap.sensors import ArrayOffsets, LaserScan, MicArray, OffsetVerdict
 from soundmap.sound import AudioScans
@@ -126,15 +126,10 @@ def offset_by(run: Heard, clock_s: float, yaw_rad: float) -> Heard:
 def found_offsets(run: Heard) -> tuple[ArrayOffsets, float]:
     """Offsets, and the CPU time that they took for each minute of the log [s]."""
     began = time.process_time()
-    assert run.scans.sharp is not None
-    found = array_offsets(
-        run.scans.sharp,
-        run.scans.time_ns,
-        run.trajectory,
-        run.array,
-        run.config.scan,
-        CalibrateConfig(),
-    )
+    by_peaks = offsets_by_peaks(run.scans, run.trajectory, run.array, run.config)
+    assert by_peaks is not None
+    where = run.surroundings, run.trajectory, run.array, run.config
+    found = refined_offsets(by_peaks, run.scans, *where)
     return found, (time.process_time() - began) * 60.0 / run.duration_s
 
 

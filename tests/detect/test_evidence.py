@@ -2,10 +2,16 @@ import numpy as np
 import pytest
 
 from soundmap.config import ArrayConfig, ScanConfig
-from soundmap.detect.evidence import LONG_RUN_SCANS, gathered_evidence, ranged_scans
+from soundmap.detect.evidence import (
+    LONG_RUN_SCANS,
+    gathered_evidence,
+    ranged_scans,
+    velocities,
+)
 from soundmap.geometry import Mount, Trajectory
 from soundmap.sensors import MicArray
 from soundmap.sound import AudioScans, LevelReference
+from tests.detect.box_room import observed
 
 ARRAY = MicArray(ArrayConfig().microphone_positions(), Mount.planar(0.1, 0.0, 0.5, 0.3), None)
 
@@ -62,3 +68,19 @@ def test_ranges_are_needed_of_just_those_scans_that_are_told(count):
     ranges[needed] = needed[:, None]
     evidence = gathered_evidence(kept, ranges, trajectory, ARRAY, ScanConfig())
     assert evidence.range_m[:, 0].tolist() == needed.tolist()
+
+
+def test_velocities_are_those_of_the_array_at_each_scan():
+    scans, _, track, array = observed([(5.0, 3.0, 10.0)])
+    config = ScanConfig()
+    evidence = gathered_evidence(
+        scans, np.ones((len(scans), 360), np.float32), track, array, config
+    )
+    rate = velocities(scans, track, array, config)
+    assert rate.shape == (len(evidence), 3)
+    turning = np.abs(rate[:, 2]) > 0.5
+    np.testing.assert_allclose(rate[turning][3:-3, 2], 0.5 * np.pi / 2.0, rtol=0.05)
+    straight = evidence.place_m[:, 0] < 3.5
+    np.testing.assert_allclose(
+        rate[straight][1:, :2], [[0.3, 0.0]] * (straight.sum() - 1), atol=1e-6
+    )

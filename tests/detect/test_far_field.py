@@ -79,3 +79,16 @@ def test_its_part_of_the_normal_equations_is_that_of_its_columns(evidence):
     np.testing.assert_allclose(held, np.diag(np.diag(held)), atol=2e-4 * scale)
     assert np.all(np.diag(held) > 0.0)
     assert np.all(np.diag(held) < 0.1 * np.diag(normal))
+
+
+@pytest.mark.parametrize("hand", [1, -1])
+def test_a_far_field_changes_as_the_array_turns(evidence, hand):
+    evidence = replace(evidence, handedness=hand)
+    field = np.random.default_rng(3).standard_normal(int(evidence.table.starts[-1]))
+    step = 1e-3
+    before, after = (
+        FarField(replace(evidence, axis_rad=evidence.axis_rad + side * step)).heard(field)
+        for side in (-1.0, 1.0)
+    )
+    turned = FarField(evidence).turned(field)
+    assert np.abs(turned - (after - before) / (2.0 * step)).max() < 2e-3 * np.abs(turned).max()

@@ -113,7 +113,7 @@ def test_the_far_field_is_taken_out_of_the_equations_of_places(before_far_field)
     fit = before_far_field
     hessian, _, owners = fit._system(fit.components)
     count, starts = len(owners), fit.evidence.table.starts
-    own = np.stack(list(fit._derivatives(owners, slice(None)))).astype(np.float64)
+    own = np.stack(list(fit.derivatives(owners, slice(None)))).astype(np.float64)
     column = fit.components[0].column.astype(np.float64)
     size = int(starts[-1])
     far = np.stack([fit.far_field.heard(unit) for unit in np.eye(size)]).astype(np.float64)

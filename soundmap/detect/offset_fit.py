@@ -1,0 +1,226 @@
+r"""Offset fit: what the array's clock and yaw lack, by all that was heard.
+
+The bearings of peaks are pulled by whatever sounds beside them. The sparse fit knows what sounds
+beside them: with its components where they are, a scan is
+
+.. math:: y_s = \sum_k q_k \, a_{k,s} + A_s f + J_s \, (\delta, \psi)^T + e_s,
+
+J being the derivative of what the components add directly, and of the far field, by what the
+array's clock :math:`\delta` and yaw :math:`\psi` lack. Places, shares, strengths and the far field
+are unknowns beside those two: in each step all are solved for together, and those of the fit
+eliminated. What walls reflect does not tell of :math:`\delta` and :math:`\psi`: its bearings are
+predicted from places and walls, and wrong by more than those of what is heard directly.
+
+Each harmonic of a component errs by about its own size and by chance, so that a loud source beside
+the robot does not outvote all others. The late sound of a room arrives from all heights, to which
+the array's response over the bearings differs: the far field is the sum of two such fields.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soundmap.detect.candidates import candidate_places
+from soundmap.detect.component import SHARE_SIGMA, Component, Share
+from soundmap.detect.evidence import Evidence
+from soundmap.detect.far_field import FarFieldBand
+from soundmap.detect.growth import carried_fit, rough_fit
+from soundmap.detect.harmonics import Single
+from soundmap.detect.model_errors import ComponentErrors, Precision, bearing_derivative, parts
+from soundmap.detect.regions import Region, regions, telling
+from soundmap.detect.sound_paths import NEAREST_M, Path
+from soundmap.detect.sparse_fit import HOLD, SparseFit
+from soundmap.detect.walls import surface_points, wall_lines
+from soundmap.geometry import FloatArray
+from soundmap.memory import give_back
+
+ROUNDS, STEP_SHARE = 4, 0.6
+"""Steps go this share of the way: reflections turn along with what they reflect, so that whole
+ones would go too far."""
+LEAST_SCANS, MOST_SCANS, MOST_REGIONS = 40, 250, 2
+"""Of a region so many scans are looked at, and of a large site so many regions."""
+LEAST_GAIN = 300.0
+"""The fit grows until no candidate explains more than this, in units of the noise."""
+ERRORS = ComponentErrors(bearing=0.02, harmonic=1.0)
+FAR_APERTURES = 0, 4
+"""Of the beam table: waves along the floor, and from 38 degrees above or below."""
+DAMPING = np.array([25.0, 25.0])
+"""Information on clock [1/s^2] and yaw [1/rad^2] that damps each step."""
+GREATEST_STEP = np.array([0.03, 0.03])
+GREATEST_MOVE_M = 0.1
+SETTLED = np.array([0.005, np.radians(0.5)])
+"""Rounds that end farther apart than this [s, rad] have found nothing."""
+HeardAt = Callable[[float, float], tuple[Evidence, FloatArray]]
+"""What was heard from where, and how fast the array moved (S, 3), with so much added to clock [s]
+and yaw [rad]."""
+
+
+def offsets_by_fit(start: FloatArray, heard_at: HeardAt) -> tuple[FloatArray, FloatArray] | None:
+    """Clock and yaw by the fit alone.
+
+    Parameters
+    ----------
+    start : ndarray, shape (2,)
+        Clock [s] and yaw [rad] to begin from, right to within some 15 ms and 1.5 degrees.
+    heard_at : callable
+
+    Returns
+    -------
+    state, covariance : ndarray, shapes (2,) and (2, 2)
+        None if nothing is told.
+    """
+    state, ends = start, [start]
+    sites: list[_Site] = []
+    for _ in range(ROUNDS):
+        evidence, velocity = heard_at(float(state[0]), float(state[1]))
+        if not sites:
+            sites = _sites(evidence)
+            give_back()
+        told = [each for site in sites if (each := site.told(evidence, velocity)) is not None]
+        if not told:
+            return None
+        information = np.diag(DAMPING) + sum(each.information for each in told)
+        covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
+        step = covariance @ sum(each.pull for each in told)
+        step = np.clip(STEP_SHARE * step, -GREATEST_STEP, GREATEST_STEP)
+        for each in told:
+            each.move(step)
+        state = state + step
+        ends.append(state)
+    if np.any(np.abs(ends[-1] - ends[-2]) > SETTLED):
+        return None
+    return state, covariance
+
+
+@dataclass
+class _Site:
+    """A region and what sounds there: all that is kept of a fit, which is large."""
+
+    region: Region
+    walls: FloatArray
+    components: Sequence[Component]
+
+    def told(self, evidence: Evidence, velocity: FloatArray) -> _Told | None:
+        """What it tells of clock and yaw; None if nothing sounds there."""
+        scans = _some(telling(evidence, self.region.low_m, self.region.high_m))
+        if len(scans) < LEAST_SCANS:
+            return None
+        fit = carried_fit(self.components, self.walls, evidence.chosen(scans))
+        self.components = fit.components
+        give_back()
+        return _told(fit, velocity[scans]) if fit.components else None
+
+
+def _sites(evidence: Evidence) -> list[_Site]:
+    """The regions with most scans, and a rough fit to each."""
+    sites = []
+    for region in sorted(regions(evidence), key=lambda each: -len(each.evidence))[:MOST_REGIONS]:
+        some = region.evidence.chosen(_some(np.arange(len(region.evidence))))
+        if len(some) >= LEAST_SCANS:
+            surface = surface_points(some)
+            walls, candidates = wall_lines(surface), candidate_places(some, surface)
+            fit = rough_fit(some, walls, candidates, least_gain=LEAST_GAIN)
+            sites.append(_Site(region, walls, fit.components))
+    return sites
+
+
+def _some(scans: NDArray[np.int64]) -> NDArray[np.int64]:
+    """No more than `MOST_SCANS` of them, evenly chosen."""
+    count = min(len(scans), MOST_SCANS)
+    return scans[np.arange(count) * len(scans) // max(count, 1)]
+
+
+@dataclass(frozen=True)
+class _Told:
+    """What a fit tells of clock and yaw, its own unknowns eliminated.
+
+    ``information`` (2, 2) and ``pull`` (2,) are of clock and yaw. The step of the fit's unknowns is
+    ``alone`` less ``bound`` times that of clock and yaw; places and shares come first.
+    """
+
+    information: FloatArray
+    pull: FloatArray
+    alone: FloatArray
+    bound: FloatArray
+    owners: Sequence[tuple[Component, int]]
+
+    def move(self, step: FloatArray) -> None:
+        """Places as such a step of clock and yaw has them."""
+        own = STEP_SHARE * self.alone - self.bound @ step
+        for (component, axis), move in zip(self.owners, own[: len(self.owners)], strict=True):
+            if axis < 2:
+                component.place_m[axis] += np.clip(move, -GREATEST_MOVE_M, GREATEST_MOVE_M)
+
+
+def _told(fit: SparseFit, velocity: FloatArray) -> _Told:
+    evidence, starts = fit.evidence, fit.evidence.table.starts
+    del fit.precision  # it is large, and the next one, too
+    precision = Precision(evidence, fit.components, fit.far_heard, ERRORS)
+    offsets = _by_offsets(fit, velocity)
+    owners = fit.unknowns(fit.components)
+    first = 2 + len(owners)
+    far = [
+        [FarFieldBand(evidence, band, slice(*own), aperture) for aperture in FAR_APERTURES]
+        for band, own in enumerate(pairwise(starts))
+    ]
+    sizes = [len(fit.components) + len(FAR_APERTURES) * (b - a) for a, b in pairwise(starts)]
+    ends = np.cumsum([first, *sizes])
+    normal, right = np.zeros((ends[-1], ends[-1])), np.zeros(ends[-1])
+
+    for scans in parts(len(evidence)):
+        common = np.stack([*offsets[:, scans], *fit.derivatives(owners, scans)])
+        for band, (start, stop) in enumerate(pairwise(starts)):
+            own = np.stack([each.column[scans, start:stop] for each in fit.components])
+            waves = [each.columns(scans).transpose(2, 0, 1) for each in far[band]]
+            columns = np.concatenate([common[:, :, start:stop], own, *waves]).transpose(1, 2, 0)
+            weighted = np.matmul(precision.inverse[band][scans], columns)
+            flat, weighted = (each.reshape(-1, columns.shape[2]) for each in (columns, weighted))
+            index = np.r_[:first, ends[band] : ends[band + 1]]
+            normal[np.ix_(index, index)] += flat.T @ weighted
+            right[index] += weighted.T @ fit.residual[scans, start:stop].ravel()
+    held = [HOLD if axis < 2 else SHARE_SIGMA[Share(axis)] ** -2 for _, axis in owners]
+    for band, fields in enumerate(far):
+        held += [0.0] * len(fit.components)
+        for field in fields:
+            held += [field.held] * (starts[band + 1] - starts[band])
+    normal[2:, 2:] += np.diag(held)
+    return _eliminated(normal, right, owners)
+
+
+def _eliminated(
+    normal: FloatArray, right: FloatArray, owners: Sequence[tuple[Component, int]]
+) -> _Told:
+    """Normal equations of which clock and yaw, which stand first, are left."""
+    own, coupling = normal[2:, 2:], normal[2:, :2]
+    scale = np.sqrt(np.diag(own)) + 1e-12
+    scaled = own / np.outer(scale, scale) + 1e-8 * np.eye(len(own))
+    both = np.column_stack([coupling, right[2:]]) / scale[:, None]
+    solved: FloatArray = (np.linalg.solve(scaled, both) / scale[:, None]).astype(np.float64)
+    bound, alone = solved[:, :2], solved[:, 2]
+    return _Told(
+        normal[:2, :2] - coupling.T @ bound, right[:2] - coupling.T @ alone, alone, bound, owners
+    )
+
+
+def _by_offsets(fit: SparseFit, velocity: FloatArray) -> Single:
+    """Change of what scans hear with clock [1/s] and yaw [1/rad], shape (2, S, D)."""
+    evidence, part = fit.evidence, fit.evidence.table.part
+    yaw = fit.far_field.turned(fit.far_harmonics)
+    clock = np.zeros_like(yaw)
+    for component in fit.components:
+        if not component.paths.gain[Path.DIRECT].any():
+            continue
+        turned = bearing_derivative(evidence, component.paths) * np.float32(evidence.handedness)
+        turned *= component.strength[part].astype(np.float32)
+        step = component.place_m - evidence.place_m
+        square = np.maximum(np.sum(step**2, axis=1), NEAREST_M**2)
+        passing = (step[:, 1] * velocity[:, 0] - step[:, 0] * velocity[:, 1]) / square
+        yaw -= turned
+        clock += turned * passing.astype(np.float32)[:, None]
+    clock += yaw * velocity[:, 2].astype(np.float32)[:, None]
+    return np.stack([clock, yaw])
