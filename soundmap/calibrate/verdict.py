@@ -10,6 +10,7 @@ from soundmap.sensors import ArrayOffsets, Offset, OffsetVerdict
 USEFUL = np.array([0.015, np.radians(1.5)])
 """Results less certain than this, as a standard deviation, are of no use [s, rad]."""
 CLEAR_SIGMAS = 3.5
+"""Offsets of more standard deviations than this are clear."""
 
 
 def judged(

@@ -158,6 +158,11 @@ class _Told:
 
 
 def _told(fit: SparseFit, velocity: FloatArray) -> _Told:
+    """Normal equations of clock, yaw and all unknowns of a fit, summed up part by part.
+
+    Clock and yaw come first, then places and shares, then for each sub-band the strengths and the
+    harmonics of the far field. The fit is of no use afterwards.
+    """
     evidence, starts = fit.evidence, fit.evidence.table.starts
     del fit.precision  # it is large, and the next one, too
     precision = Precision(evidence, fit.components, fit.far_heard, ERRORS)
@@ -171,7 +176,6 @@ def _told(fit: SparseFit, velocity: FloatArray) -> _Told:
     sizes = [len(fit.components) + len(FAR_APERTURES) * (b - a) for a, b in pairwise(starts)]
     ends = np.cumsum([first, *sizes])
     normal, right = np.zeros((ends[-1], ends[-1])), np.zeros(ends[-1])
-
     for scans in parts(len(evidence)):
         common = np.stack([*offsets[:, scans], *fit.derivatives(owners, scans)])
         for band, (start, stop) in enumerate(pairwise(starts)):
