@@ -47,7 +47,9 @@ def response(toward, aperture=1.0):
     return total / 40
 
 
-def observed(emitters, *, ambient=1.0, above_m=0.0, far=(), seed=1, speed_m_s=0.3):
+def observed(
+    emitters, *, ambient=1.0, above_m=0.0, far=(), far_aperture=1.0, seed=1, speed_m_s=0.3
+):
     """Audio scans, laser ranges, way and array.
 
     Emitters are x, y and power at 1 m; far are bearings of the map and the power from there.
@@ -69,7 +71,7 @@ def observed(emitters, *, ambient=1.0, above_m=0.0, far=(), seed=1, speed_m_s=0.
             aperture = np.sqrt(square / (square + down**2))
             heard += 0.5 * strength / (square + down**2) * response(toward, aperture)
         for bearing, strength in far:
-            heard += strength * response(bearing - turn)
+            heard += strength * response(bearing - turn, far_aperture)
         power.append(heard * (1.0 + 0.02 * rng.standard_normal((4, 120))))
         ray = 2.0 * np.pi * np.arange(360) / 360 + turn
         with np.errstate(divide="ignore"):

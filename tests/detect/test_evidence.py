@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,7 @@ from soundmap.detect.evidence import (
     ranged_scans,
     velocities,
 )
-from soundmap.geometry import Mount, Trajectory
+from soundmap.geometry import Mount, Trajectory, wrapped_angle
 from soundmap.sensors import MicArray
 from soundmap.sound import AudioScans, LevelReference
 from tests.detect.box_room import observed
@@ -70,8 +72,11 @@ def test_ranges_are_needed_of_just_those_scans_that_are_told(count):
     assert evidence.range_m[:, 0].tolist() == needed.tolist()
 
 
-def test_velocities_are_those_of_the_array_at_each_scan():
+@pytest.mark.parametrize("heading", [0.0, np.pi - 0.50, np.pi - 0.54])  # two turn past west
+def test_velocities_are_those_of_the_array_at_each_scan(heading):
     scans, _, track, array = observed([(5.0, 3.0, 10.0)])
+    turned = wrapped_angle(track.pose[:, 2] + heading)  # as it stands; it still drives as before
+    track = replace(track, pose=np.column_stack([track.pose[:, :2], turned]))
     config = ScanConfig()
     evidence = gathered_evidence(
         scans, np.ones((len(scans), 360), np.float32), track, array, config

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from soundmap.config import ScanConfig
 from soundmap.detect.evidence import gathered_evidence, velocities
-from soundmap.detect.offset_fit import _by_offsets, offsets_by_fit
+from soundmap.detect.offset_fit import MOST_SCANS, _by_offsets, _some, _Told, offsets_by_fit
 from soundmap.detect.sound_paths import Kind, Path, sound_paths, waves_heard
 from soundmap.detect.sparse_fit import SparseFit
 from tests.detect.box_room import observed
@@ -58,6 +59,29 @@ def test_what_a_rough_start_has_wrong_is_found(more, clock_ms, yaw_deg):
     assert 1e3 * clock == pytest.approx(clock_ms, abs=2.5)
     assert np.degrees(yaw) == pytest.approx(yaw_deg, abs=0.25)
     assert np.all(np.sqrt(np.diag(covariance)) < [0.01, np.radians(1.0)])
+
+
+def test_a_field_from_above_does_not_pull_the_clock():
+    far = [(0.5, 40.0), (2.0, 25.0), (4.0, 30.0)]
+    told = offsets_by_fit(np.zeros(2), heard_in_room(far=far, far_aperture=0.79))
+    assert told is not None
+    clock, yaw = told[0]
+    assert abs(clock) < 0.0025
+    assert abs(yaw) < np.radians(0.25)
+
+
+def test_a_place_moves_against_what_the_offsets_explain():
+    source = SimpleNamespace(place_m=np.array([1.0, 2.0]))
+    nothing, owners = np.zeros(2), [(source, 0), (source, 1)]
+    told = _Told(np.eye(2), nothing, nothing, np.array([[0.0, 1.0], [2.0, 0.0]]), owners)
+    told.move(np.array([0.01, 0.03]))
+    np.testing.assert_allclose(source.place_m, [0.97, 1.98])
+
+
+def test_of_many_scans_some_are_looked_at_evenly():
+    many = 7 + np.arange(3 * MOST_SCANS)
+    assert np.array_equal(_some(many), many[::3])
+    assert np.array_equal(_some(many[:5]), many[:5])
 
 
 def test_silence_and_few_scans_tell_nothing():
