@@ -54,7 +54,7 @@ DAMPING = np.array([25.0, 25.0])
 GREATEST_STEP = np.array([0.03, 0.03])
 GREATEST_MOVE_M = 0.1
 SETTLED = np.array([0.005, np.radians(0.5)])
-"""Rounds that end farther apart than this [s, rad] have found nothing."""
+"""A fit whose last step is greater than this [s, rad] has found nothing."""
 HeardAt = Callable[[float, float], tuple[Evidence, FloatArray]]
 """What was heard from where, and how fast the array moved (S, 3), with so much added to clock [s]
 and yaw [rad]."""
@@ -74,7 +74,7 @@ def offsets_by_fit(start: FloatArray, heard_at: HeardAt) -> tuple[FloatArray, Fl
     state, covariance : ndarray, shapes (2,) and (2, 2)
         None if nothing is told.
     """
-    state, ends = start, [start]
+    state = start
     sites: list[_Site] = []
     for _ in range(ROUNDS):
         evidence, velocity = heard_at(float(state[0]), float(state[1]))
@@ -91,8 +91,7 @@ def offsets_by_fit(start: FloatArray, heard_at: HeardAt) -> tuple[FloatArray, Fl
         for each in told:
             each.move(step)
         state = state + step
-        ends.append(state)
-    if np.any(np.abs(ends[-1] - ends[-2]) > SETTLED):
+    if np.any(np.abs(step) > SETTLED):
         return None
     return state, covariance
 
