@@ -14,9 +14,12 @@ from soundmap.config import CalibrateConfig, ScanConfig
 from soundmap.geometry import FloatArray
 from soundmap.sensors import ArrayOffsets, MicArray
 
-SYSTEMATIC = np.array([0.003, np.radians(0.28)])
-"""What the covariance of the fit does not know of, as seen on simulated sites [s, rad]; more where
-the array's beam is wide."""
+TOO_SURE = 1.4
+"""Standard deviations of the fit are this much too small, as seen on simulated sites: sound that
+interferes with its reflections errs alike in scans taken near to each other."""
+SYSTEMATIC = np.array([0.001, np.radians(0.2)])
+"""What does not grow less the more turns there are [s, rad], microphones that are not quite where
+they are said to be among it; more where the array's beam is wide."""
 AGREEING_SIGMAS = 3.5
 """A fit that differs by more from what peaks tell is not believed."""
 
@@ -46,7 +49,7 @@ def joined_offsets(
     """
     fitted, covariance = by_fit
     blur = beam_blur(array.positions_m, bearings, low_hz=scan.low_hz, high_hz=scan.high_hz)
-    sigma = np.sqrt(np.diag(covariance) + (blur * SYSTEMATIC) ** 2)
+    sigma = np.sqrt(TOO_SURE**2 * np.diag(covariance) + (blur * SYSTEMATIC) ** 2)
     peaks = np.array([by_peaks.clock.value, by_peaks.yaw.value])
     peaks_sigma = np.array([by_peaks.clock.sigma, by_peaks.yaw.sigma])
     if np.any(np.abs(fitted - peaks) > AGREEING_SIGMAS * np.hypot(sigma, peaks_sigma)):

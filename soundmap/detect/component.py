@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import IntEnum
 
+import numpy as np
+
 from soundmap.detect.harmonics import Single
 from soundmap.detect.model_errors import Precision
-from soundmap.detect.sound_paths import Kind, Paths
+from soundmap.detect.sound_paths import Kind, Path, Paths
 from soundmap.geometry import FloatArray
 
 
@@ -24,6 +26,8 @@ class Share(IntEnum):
 ASSUMED = {Share.CLOSE_WALLS: 0.5, Share.ROOM: 0.5, Share.HIDDEN: 0.2}
 """Shares as long as the scans do not tell them. Walls reflect half; none passes a wall, but much a
 table whose edge or legs the lasers see."""
+EVEN = np.zeros(2)
+"""The directivity of what sounds the same in all directions."""
 SHARE_SIGMA = {Share.CLOSE_WALLS: 0.08, Share.ROOM: 0.03, Share.HIDDEN: 0.04}
 """How firmly shares are held to what is assumed of them."""
 
@@ -45,6 +49,9 @@ class Component:
     paths : Paths
     column : ndarray of float32, shape (S, D)
         What it adds at strength 1.
+    directivity : ndarray, shape (2,)
+        Toward a unit vector u of the map it sends exp(directivity . u) of its power; the gains of
+        its paths have that in them.
     ways : dict
         For each `Share` those paths that have it and that any scan hears.
     weighted : ndarray of float32, shape (S, D), optional
@@ -60,7 +67,13 @@ class Component:
     strength: FloatArray
     paths: Paths
     column: Single
+    directivity: FloatArray = field(default_factory=EVEN.copy)
     ways: dict[Share, list[int]] = field(default_factory=dict)
     weighted: Single | None = None
     weighted_by: Precision | None = None
     coupling: FloatArray | None = None
+
+    def taken(self) -> list[tuple[int, float]]:
+        """All paths that it takes, and the part of its power that each has."""
+        others = [(way, self.shares[share]) for share, ways in self.ways.items() for way in ways]
+        return [(int(Path.DIRECT), 1.0), *others]

@@ -122,7 +122,9 @@ def carried_fit(
     """The components of a fit, fitted to other scans of the same sounds."""
     fit = SparseFit(evidence, walls)
     for component in components:
-        joined = fit.add(component.place_m, component.height_m, component.kind)
+        joined = fit.add(
+            component.place_m, component.height_m, component.kind, component.directivity
+        )
         joined.strength = component.strength
         joined.shares.update(component.shares)
     fit.renew()

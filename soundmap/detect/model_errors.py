@@ -31,12 +31,8 @@ from soundmap.detect.sound_paths import Path, Paths, waves_heard
 from soundmap.geometry import FloatArray
 from soundmap.side_by_side import side_by_side
 
-STRENGTH_ERROR = 0.35
-"""Standard deviation of a source's strength in one scan, over its mean strength."""
 APERTURE_ERROR = 0.03
-"""Of the cosine of its elevation."""
-REFLECTION_ERROR = 0.35
-"""Of the share of power that walls and the floor reflect."""
+"""Standard deviation of the cosine of a component's elevation."""
 REFLECTED = 0.5
 """What a wall reflects of a component's sound, as far as errors of its harmonics go."""
 HIDDEN_ERROR = 0.35
@@ -50,7 +46,7 @@ SCANS_AT_ONCE = 128
 
 @dataclass(frozen=True)
 class ComponentErrors:
-    """How a component's direct sound errs in one scan.
+    """How a component's sound errs in one scan.
 
     Attributes
     ----------
@@ -59,10 +55,16 @@ class ComponentErrors:
         interference.
     harmonic : float
         Of each harmonic of it and of its reflections by walls, over its size.
+    strength : float
+        Of its strength, over its mean strength.
+    reflection : float
+        Of the share of its power that walls and the floor reflect.
     """
 
     bearing: float = 0.2
     harmonic: float = 0.0
+    strength: float = 0.35
+    reflection: float = 0.35
 
 
 USUAL_ERRORS = ComponentErrors()
@@ -113,7 +115,7 @@ class Precision:
 
         def invert(scans: slice) -> None:
             loud: list[list[Single]] = [[] for _ in self.inverse]  # what is quiet goes at once
-            modes = [_modes(evidence, each, scans, errors.bearing) for each in components]
+            modes = [_modes(evidence, each, scans, errors) for each in components]
             if far_field is not None:
                 modes.append(iter([np.float32(FAR_FIELD_ERROR) * far_field[scans]]))
             for mode in chain.from_iterable(modes):
@@ -197,14 +199,14 @@ def _inverse(modes: list[Single], size: int, alone: Single) -> Single:
 
 
 def _modes(
-    evidence: Evidence, component: Sounding, scans: slice, bearing_error: float
+    evidence: Evidence, component: Sounding, scans: slice, errors: ComponentErrors
 ) -> Iterator[Single]:
     """Modes of one component in some scans, each (S, D)."""
     if not component.strength.any():
         return
     part = evidence.table.part
     strength = component.strength[part].astype(np.float32)
-    bearing = (bearing_error * evidence.table.width_rad)[part].astype(np.float32)
+    bearing = (errors.bearing * evidence.table.width_rad)[part].astype(np.float32)
     paths = component.paths
     wave, gain = paths.wave[:, scans], paths.gain[:, scans]
     aperture = paths.aperture[:, scans]
@@ -216,21 +218,23 @@ def _modes(
 
     if gain[Path.DIRECT].any():
         here = heard(Path.DIRECT)
-        yield here * (np.float32(STRENGTH_ERROR) * strength)
+        yield here * (np.float32(errors.strength) * strength)
         yield bearing_derivative(evidence, paths, scans) * (bearing * strength)
         lowered = heard(Path.DIRECT, lowered=APERTURE_ERROR)
         yield (here - lowered) * strength
     for path in (Path.FLOOR, *range(Path.WALLS, len(gain))):
         if gain[path].any():
-            yield heard(path) * (np.float32(REFLECTION_ERROR) * strength)
+            yield heard(path) * (np.float32(errors.reflection) * strength)
     if gain[Path.HIDDEN].any():
         yield heard(Path.HIDDEN) * (np.float32(HIDDEN_ERROR) * strength)
 
 
-def bearing_derivative(evidence: Evidence, paths: Paths, scans: slice = slice(None)) -> Single:
-    """Change of what is heard directly with the bearing, shape (S, D) [1/rad]."""
-    wave, aperture = paths.wave[Path.DIRECT, scans], paths.aperture[Path.DIRECT, scans]
+def bearing_derivative(
+    evidence: Evidence, paths: Paths, scans: slice = slice(None), *, path: int = Path.DIRECT
+) -> Single:
+    """Change of what is heard along a path with the bearing, shape (S, D) [1/rad]."""
+    wave, aperture = paths.wave[path, scans], paths.aperture[path, scans]
     step = 2.0 * np.pi / evidence.table.waves
-    gain = paths.gain[Path.DIRECT, scans] / (2.0 * step)
+    gain = paths.gain[path, scans] / (2.0 * step)
     after = waves_heard(evidence, wave + 1.0, aperture, gain, scans)
     return after - waves_heard(evidence, wave - 1.0, aperture, gain, scans)

@@ -5,15 +5,17 @@ beside them: with its components where they are, a scan is
 
 .. math:: y_s = \sum_k q_k \, a_{k,s} + A_s f + J_s \, (\delta, \psi)^T + e_s,
 
-J being the derivative of what the components add directly, and of the far field, by what the
-array's clock :math:`\delta` and yaw :math:`\psi` lack. Places, shares, strengths and the far field
-are unknowns beside those two: in each step all are solved for together, and those of the fit
-eliminated. What walls reflect does not tell of :math:`\delta` and :math:`\psi`: its bearings are
-predicted from places and walls, and wrong by more than those of what is heard directly.
+J being its derivative by what the array's clock :math:`\delta` and yaw :math:`\psi` lack. Places,
+shares, strengths, directivities and the far field are unknowns beside those two: in each step all
+are solved for together, and those of the fit eliminated.
 
-Each harmonic of a component errs by about its own size and by chance, so that a loud source beside
-the robot does not outvote all others. The late sound of a room arrives from all heights, to which
-the array's response over the bearings differs: the far field is the sum of two such fields.
+Strengths and reflections err by their own size, scan by scan, since direct sound interferes with
+what floor and walls reflect: what tells of :math:`\delta` and :math:`\psi` is the shape over the
+bearings. Each harmonic of a component errs by about its own size besides, so that a loud source
+beside the robot does not outvote all others. Machines radiate less to their backs, and what walls
+reflect shows up on other bearings: hence the directivities, of level as a cosine of the direction.
+The late sound of a room arrives from all heights, to which the array's response over the bearings
+differs: the far field is the sum of two such fields.
 """
 
 from __future__ import annotations
@@ -30,29 +32,32 @@ from soundmap.detect.component import SHARE_SIGMA, Component, Share
 from soundmap.detect.evidence import Evidence
 from soundmap.detect.far_field import FarFieldBand
 from soundmap.detect.growth import carried_fit, rough_fit
-from soundmap.detect.harmonics import Single
-from soundmap.detect.model_errors import ComponentErrors, Precision, bearing_derivative, parts
+from soundmap.detect.model_errors import ComponentErrors, Precision, parts
+from soundmap.detect.offset_derivatives import by_directivity, by_offsets
 from soundmap.detect.regions import Region, regions, telling
-from soundmap.detect.sound_paths import NEAREST_M, Path
+from soundmap.detect.sound_paths import Kind
 from soundmap.detect.sparse_fit import HOLD, SparseFit
 from soundmap.detect.walls import surface_points, wall_lines
 from soundmap.geometry import FloatArray
 from soundmap.memory import give_back
 
-ROUNDS, STEP_SHARE = 4, 0.6
+ROUNDS, STEP_SHARE = 5, 0.8
 """Steps go this share of the way: reflections turn along with what they reflect, so that whole
 ones would go too far."""
 LEAST_SCANS, MOST_SCANS, MOST_REGIONS = 40, 250, 2
 """Of a region so many scans are looked at, and of a large site so many regions."""
 LEAST_GAIN = 300.0
 """The fit grows until no candidate explains more than this, in units of the noise."""
-ERRORS = ComponentErrors(bearing=0.02, harmonic=1.0)
+ERRORS = ComponentErrors(bearing=0.02, harmonic=1.0, strength=1.0, reflection=1.0)
+DIRECTIVITY_SIGMA = 0.7
+"""Of each component of a directivity: 6 dB from front to back."""
 FAR_APERTURES = 0, 4
 """Of the beam table: waves along the floor, and from 38 degrees above or below."""
 DAMPING = np.array([25.0, 25.0])
 """Information on clock [1/s^2] and yaw [1/rad^2] that damps each step."""
 GREATEST_STEP = np.array([0.03, 0.03])
-GREATEST_MOVE_M = 0.1
+GREATEST_MOVE_M, GREATEST_LOBE = 0.1, 0.5
+"""Most that a place and a directivity change in one step."""
 SETTLED = np.array([0.005, np.radians(0.5)])
 """A fit whose last step is greater than this [s, rad] has found nothing."""
 HeardAt = Callable[[float, float], tuple[Evidence, FloatArray]]
@@ -139,7 +144,8 @@ class _Told:
     """What a fit tells of clock and yaw, its own unknowns eliminated.
 
     ``information`` (2, 2) and ``pull`` (2,) are of clock and yaw. The step of the fit's unknowns is
-    ``alone`` less ``bound`` times that of clock and yaw; places and shares come first.
+    ``alone`` less ``bound`` times that of clock and yaw; places and shares come first, then the
+    directivities (x and y) of ``directed``.
     """
 
     information: FloatArray
@@ -147,27 +153,33 @@ class _Told:
     alone: FloatArray
     bound: FloatArray
     owners: Sequence[tuple[Component, int]]
+    directed: Sequence[Component]
 
     def move(self, step: FloatArray) -> None:
-        """Places as such a step of clock and yaw has them."""
+        """Places and directivities as such a step of clock and yaw has them."""
         own = STEP_SHARE * self.alone - self.bound @ step
-        for (component, axis), move in zip(self.owners, own[: len(self.owners)], strict=True):
+        count = len(self.owners)
+        for (component, axis), move in zip(self.owners, own[:count], strict=True):
             if axis < 2:
                 component.place_m[axis] += np.clip(move, -GREATEST_MOVE_M, GREATEST_MOVE_M)
+        lobes = own[count : count + 2 * len(self.directed)].reshape(-1, 2)
+        for component, lobe in zip(self.directed, lobes, strict=True):
+            component.directivity += np.clip(lobe, -GREATEST_LOBE, GREATEST_LOBE)
 
 
 def _told(fit: SparseFit, velocity: FloatArray) -> _Told:
     """Normal equations of clock, yaw and all unknowns of a fit, summed up part by part.
 
-    Clock and yaw come first, then places and shares, then for each sub-band the strengths and the
-    harmonics of the far field. The fit is of no use afterwards.
+    Clock and yaw come first, then places and shares, then directivities, then for each sub-band the
+    strengths and the harmonics of the far field. The fit is of no use afterwards.
     """
     evidence, starts = fit.evidence, fit.evidence.table.starts
     del fit.precision  # it is large, and the next one, too
     precision = Precision(evidence, fit.components, fit.far_heard, ERRORS)
-    offsets = _by_offsets(fit, velocity)
+    offsets = by_offsets(fit, velocity)
     owners = fit.unknowns(fit.components)
-    first = 2 + len(owners)
+    directed = [each for each, axis in owners if axis == 0 and each.kind == Kind.SOURCE]
+    first = 2 + len(owners) + 2 * len(directed)
     far = [
         [FarFieldBand(evidence, band, slice(*own), aperture) for aperture in FAR_APERTURES]
         for band, own in enumerate(pairwise(starts))
@@ -176,7 +188,8 @@ def _told(fit: SparseFit, velocity: FloatArray) -> _Told:
     ends = np.cumsum([first, *sizes])
     normal, right = np.zeros((ends[-1], ends[-1])), np.zeros(ends[-1])
     for scans in parts(len(evidence)):
-        common = np.stack([*offsets[:, scans], *fit.derivatives(owners, scans)])
+        lobes = [by_directivity(fit, each, axis, scans) for each in directed for axis in (0, 1)]
+        common = np.stack([*offsets[:, scans], *fit.derivatives(owners, scans), *lobes])
         for band, (start, stop) in enumerate(pairwise(starts)):
             own = np.stack([each.column[scans, start:stop] for each in fit.components])
             waves = [each.columns(scans).transpose(2, 0, 1) for each in far[band]]
@@ -187,43 +200,26 @@ def _told(fit: SparseFit, velocity: FloatArray) -> _Told:
             normal[np.ix_(index, index)] += flat.T @ weighted
             right[index] += weighted.T @ fit.residual[scans, start:stop].ravel()
     held = [HOLD if axis < 2 else SHARE_SIGMA[Share(axis)] ** -2 for _, axis in owners]
+    held += [DIRECTIVITY_SIGMA**-2] * (2 * len(directed))
+    if directed:
+        lobe = np.concatenate([component.directivity for component in directed])
+        right[first - len(lobe) : first] -= lobe / DIRECTIVITY_SIGMA**2
     for band, fields in enumerate(far):
         held += [0.0] * len(fit.components)
         for field in fields:
             held += [field.held] * (starts[band + 1] - starts[band])
     normal[2:, 2:] += np.diag(held)
-    return _eliminated(normal, right, owners)
+    return _Told(*_eliminated(normal, right), owners, directed)
 
 
 def _eliminated(
-    normal: FloatArray, right: FloatArray, owners: Sequence[tuple[Component, int]]
-) -> _Told:
-    """Normal equations of which clock and yaw, which stand first, are left."""
+    normal: FloatArray, right: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Normal equations of which clock and yaw, which stand first, are left; as in `_Told`."""
     own, coupling = normal[2:, 2:], normal[2:, :2]
     scale = np.sqrt(np.diag(own)) + 1e-12
     scaled = own / np.outer(scale, scale) + 1e-8 * np.eye(len(own))
     both = np.column_stack([coupling, right[2:]]) / scale[:, None]
     solved: FloatArray = (np.linalg.solve(scaled, both) / scale[:, None]).astype(np.float64)
     bound, alone = solved[:, :2], solved[:, 2]
-    return _Told(
-        normal[:2, :2] - coupling.T @ bound, right[:2] - coupling.T @ alone, alone, bound, owners
-    )
-
-
-def _by_offsets(fit: SparseFit, velocity: FloatArray) -> Single:
-    """Change of what scans hear with clock [1/s] and yaw [1/rad], shape (2, S, D)."""
-    evidence, part = fit.evidence, fit.evidence.table.part
-    yaw = fit.far_field.turned(fit.far_harmonics)
-    clock = np.zeros_like(yaw)
-    for component in fit.components:
-        if not component.paths.gain[Path.DIRECT].any():
-            continue
-        turned = bearing_derivative(evidence, component.paths) * np.float32(evidence.handedness)
-        turned *= component.strength[part].astype(np.float32)
-        step = component.place_m - evidence.place_m
-        square = np.maximum(np.sum(step**2, axis=1), NEAREST_M**2)
-        passing = (step[:, 1] * velocity[:, 0] - step[:, 0] * velocity[:, 1]) / square
-        yaw -= turned
-        clock += turned * passing.astype(np.float32)[:, None]
-    clock += yaw * velocity[:, 2].astype(np.float32)[:, None]
-    return np.stack([clock, yaw])
+    return normal[:2, :2] - coupling.T @ bound, right[:2] - coupling.T @ alone, alone, bound

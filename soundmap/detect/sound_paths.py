@@ -109,6 +109,37 @@ def sound_paths(
     )
 
 
+def heard_places(walls: FloatArray, place_m: FloatArray) -> FloatArray:
+    """Where a source seems to be along each path: itself, or its mirror image, shape (P, 2) [m].
+
+    Parameters
+    ----------
+    walls : ndarray, shape (W, 3)
+    place_m : ndarray, shape (2,)
+    """
+    off = walls[:, :2] @ place_m - walls[:, 2]
+    return np.concatenate(
+        [np.tile(place_m, (Path.WALLS, 1)), place_m - 2.0 * off[:, None] * walls[:, :2]]
+    )
+
+
+def departures(walls: FloatArray, place_m: FloatArray, stand_m: FloatArray) -> FloatArray:
+    """Directions in which sound leaves a source along each path, unit vectors (P, S, 2) in the map.
+
+    Parameters
+    ----------
+    walls : ndarray, shape (W, 3)
+    place_m : ndarray, shape (2,)
+        Of the source [m].
+    stand_m : ndarray, shape (S, 2)
+        Of the array [m].
+    """
+    way = stand_m - heard_places(walls, place_m)[:, None]
+    normal = walls[:, None, :2]
+    way[Path.WALLS :] -= 2.0 * np.sum(way[Path.WALLS :] * normal, axis=2, keepdims=True) * normal
+    return np.asarray(way / np.maximum(np.linalg.norm(way, axis=2, keepdims=True), 1e-9))
+
+
 @njit(cache=True, nogil=True)
 def seen(distance: float, beyond: float, behind: bool) -> bool:
     """Whether what lies so far away, and so far behind the first surface, is heard directly."""

@@ -13,17 +13,26 @@ distance, and would pull them off.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from soundmap.detect.component import ASSUMED, SHARE_SIGMA, Component, Share
+from soundmap.detect.component import ASSUMED, EVEN, SHARE_SIGMA, Component, Share
 from soundmap.detect.evidence import Evidence
 from soundmap.detect.far_field import FarField
 from soundmap.detect.harmonics import Single
 from soundmap.detect.model_errors import Precision, bearing_derivative, parts
-from soundmap.detect.sound_paths import NEAREST_M, Kind, Path, sound_paths, waves_heard
+from soundmap.detect.sound_paths import (
+    NEAREST_M,
+    Kind,
+    Path,
+    Paths,
+    departures,
+    sound_paths,
+    waves_heard,
+)
 from soundmap.geometry import FloatArray
 from soundmap.side_by_side import side_by_side
 
@@ -77,13 +86,15 @@ class SparseFit:
         """Mean square of what is left, over what was expected."""
         return self.misfit / self.evidence.heard.size
 
-    def add(self, place_m: FloatArray, height_m: float, kind: Kind) -> Component:
+    def add(
+        self, place_m: FloatArray, height_m: float, kind: Kind, directivity: FloatArray = EVEN
+    ) -> Component:
         """One component more, its strength still 0."""
         nothing = np.zeros(self.evidence.sub_bands)
-        place_m = np.array(place_m, dtype=np.float64)
-        paths = sound_paths(self.evidence, self.walls, place_m, height_m, kind)
+        place_m, directivity = np.array(place_m, dtype=np.float64), directivity.copy()
+        paths = self._paths(place_m, height_m, kind, directivity)
         component = Component(
-            place_m, height_m, kind, dict(ASSUMED), nothing, paths, self.residual[:0]
+            place_m, height_m, kind, dict(ASSUMED), nothing, paths, self.residual[:0], directivity
         )
         self._hear(component)
         self.components.append(component)
@@ -253,10 +264,20 @@ class SparseFit:
 
     def _place(self, component: Component) -> None:
         """Paths and column of a component that has moved."""
-        component.paths = sound_paths(
-            self.evidence, self.walls, component.place_m, component.height_m, component.kind
+        component.paths = self._paths(
+            component.place_m, component.height_m, component.kind, component.directivity
         )
         self._hear(component)
+
+    def _paths(
+        self, place_m: FloatArray, height_m: float, kind: Kind, directivity: FloatArray
+    ) -> Paths:
+        """Paths with the directivity in their gains."""
+        paths = sound_paths(self.evidence, self.walls, place_m, height_m, kind)
+        if not directivity.any():
+            return paths
+        toward = departures(self.walls, place_m, self.evidence.place_m)
+        return replace(paths, gain=paths.gain * np.exp(toward @ directivity))
 
     def _hear(self, component: Component) -> None:
         """Ways and column of a component that has new paths."""

@@ -57,12 +57,12 @@ class Outcome:
     sound_s_per_min: float
 
 
-def simulated(seed: int, cache: Path, *, silent: bool) -> tuple[Path, Difficulty]:
+def simulated(seed: int, cache: Path, *, silent: bool, ways: int = 1) -> tuple[Path, Difficulty]:
     """Folder of a simulated scene, from the cache if it is there."""
-    name = f"s{seed}" if silent else str(seed)
+    name = ("s" if silent else "") + str(seed) + ("" if ways == 1 else f"x{ways}")
     folder, notes = cache / name, cache / f"{name}.json"
     if not (folder / "run.mcap").is_file() or not notes.is_file():
-        difficulty = written_scene(seed, cache / f"{name}.toml", silent=silent)
+        difficulty = written_scene(seed, cache / f"{name}.toml", silent=silent, ways=ways)
         simulated_run(cache / f"{name}.toml", folder, force=True)
         notes.write_text(json.dumps(dataclasses.asdict(difficulty)))
     return folder, Difficulty(**json.loads(notes.read_text()))

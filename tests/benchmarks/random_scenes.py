@@ -52,7 +52,9 @@ class Difficulty:
     bad_odometry: bool
 
 
-def random_scene(seed: int, *, silent: bool = False) -> tuple[dict[str, Any], Difficulty]:
+def random_scene(
+    seed: int, *, silent: bool = False, ways: int = 1
+) -> tuple[dict[str, Any], Difficulty]:
     """A scene as a TOML table, and what makes it hard.
 
     Parameters
@@ -60,22 +62,28 @@ def random_scene(seed: int, *, silent: bool = False) -> tuple[dict[str, Any], Di
     seed : int
     silent : bool
         The same machines stand there, but none of them sounds.
+    ways : int
+        How many times the robot drives its way, there and back in turn.
     """
     for attempt in range(50):
         drawn = _drawn_scene(np.random.default_rng([seed, attempt]), seed)
         if drawn is None:
             continue
         table, difficulty = drawn
+        way = table["robot"]["way_points_m"]
+        there, back = way[1:], way[-2::-1]
+        more = [back if number % 2 else there for number in range(1, ways)]
+        table["robot"]["way_points_m"] = way + [point for leg in more for point in leg]
         if silent:
             table["runs"] = [{"name": "run", "sources": []}]
         return table, difficulty
     raise RuntimeError(f"seed {seed}: no possible scene in 50 attempts")
 
 
-def written_scene(seed: int, file: Path, *, silent: bool = False) -> Difficulty:
+def written_scene(seed: int, file: Path, *, silent: bool = False, ways: int = 1) -> Difficulty:
     """Write the first possible scene of a seed, checked by the simulator itself."""
     for offset in range(20):
-        table, difficulty = random_scene(seed + 100_000 * offset, silent=silent)
+        table, difficulty = random_scene(seed + 100_000 * offset, silent=silent, ways=ways)
         file.write_text(tomli_w.dumps(table), encoding="utf-8")
         try:
             loaded_scene(file)

@@ -30,10 +30,11 @@ def joined(first, clock_s, yaw_deg, covariance=COVARIANCE, *, mode="correct", sc
 
 def test_each_counts_by_what_it_is_sure_of():
     found = joined(by_peaks(0.066, 2.4), 0.060, 2.0)
-    weight = 0.005**-2 / (0.005**-2 + 0.006**-2)
+    sigma = np.hypot(1.4 * 0.004, 0.001)
+    weight = sigma**-2 / (sigma**-2 + 0.006**-2)
     assert found.clock.value == pytest.approx(0.066 - 0.006 * weight, abs=1e-5)
     assert 2.0 < np.degrees(found.yaw.value) < 2.2
-    assert found.clock.sigma == pytest.approx(0.005, rel=1e-3)  # no surer than the fit alone
+    assert found.clock.sigma == pytest.approx(sigma, rel=1e-3)  # no surer than the fit alone
     assert (found.explained, found.places) == (0.9, 7)
 
 

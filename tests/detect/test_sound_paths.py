@@ -10,6 +10,8 @@ from soundmap.detect.sound_paths import (
     FLOOR_SHARE,
     Kind,
     Path,
+    departures,
+    heard_places,
     sound_paths,
     waves_heard,
 )
@@ -86,3 +88,14 @@ def test_a_wave_is_heard_as_its_beam_and_a_turn_blurs_it():
     mean = np.mean(moments, axis=0)
     assert np.linalg.norm(turned - mean) < 0.12 * np.linalg.norm(mean)
     assert np.linalg.norm(turned) < 0.97 * np.linalg.norm(still)
+
+
+def test_sound_leaves_toward_the_point_of_reflection():
+    place, stand = np.array([2.0, 1.0]), np.zeros((1, 2))
+    np.testing.assert_allclose(heard_places(WALL, place)[[Path.FLOOR, Path.WALLS]],
+                               [[2.0, 1.0], [4.0, 1.0]])  # fmt: skip
+    toward = departures(WALL, place, stand)
+    np.testing.assert_allclose(toward[Path.DIRECT, 0], np.array([-2.0, -1.0]) / np.sqrt(5.0))
+    mirror = np.array([3.0, 0.75])
+    way = (mirror - place) / np.linalg.norm(mirror - place)
+    np.testing.assert_allclose(toward[Path.WALLS, 0], way)

@@ -1,0 +1,100 @@
+"""Changes with clock, yaw and directivity, against differences of what the fit predicts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from soundmap.config import ScanConfig
+from soundmap.detect.component import Share
+from soundmap.detect.evidence import gathered_evidence
+from soundmap.detect.offset_derivatives import by_directivity, by_offsets
+from soundmap.detect.sound_paths import Kind, Path, sound_paths, waves_heard
+from soundmap.detect.sparse_fit import SparseFit
+from tests.detect.box_room import DEPTH, observed
+
+WALLS = np.array([[0.0, 1.0, 0.0], [0.0, 1.0, DEPTH]])
+PLACE, HEIGHT_M, STRENGTH = np.array([5.5, 3.0]), 0.1, 20.0
+STEP = np.radians(1.0)  # as far apart as the beams that are told apart
+
+
+@pytest.fixture
+def evidence():
+    heard, around, way, array = observed(((6.0, 3.0, 50.0),))
+    gathered = gathered_evidence(heard, around, way, array, ScanConfig())
+    return replace(gathered, turn_rad=0.0 * gathered.turn_rad)
+
+
+def sounding(evidence, walls=WALLS):
+    fit = SparseFit(evidence, walls)
+    source = fit.add(PLACE, HEIGHT_M, Kind.SOURCE)
+    source.strength = np.full(evidence.sub_bands, STRENGTH)
+    return fit, source
+
+
+def relative_error(change, expected):
+    return np.linalg.norm(change - expected) / np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("hand", [1, -1])
+def test_scans_change_with_clock_and_yaw_as_the_array_moves(evidence, hand):
+    evidence = replace(evidence, handedness=hand)
+    rng = np.random.default_rng(5)
+    velocity = rng.standard_normal((len(evidence), 3)) * [0.3, 0.3, 0.8]
+    fit, source = sounding(evidence)
+    fit.far_harmonics = rng.standard_normal(len(fit.far_harmonics))
+    paths = source.paths
+    assert {Share.ROOM} <= set(source.ways)
+
+    def heard_after(time_s, turned_rad, *, directly):
+        """Along those paths that there are now."""
+        after = replace(
+            evidence,
+            place_m=evidence.place_m + time_s * velocity[:, :2],
+            axis_rad=evidence.axis_rad + time_s * velocity[:, 2] + turned_rad,
+        )
+        moved = sound_paths(after, WALLS, PLACE, HEIGHT_M, Kind.SOURCE)
+        total = SparseFit(after, WALLS).far_field.heard(fit.far_harmonics)
+        for path, share in source.taken():
+            if path == Path.DIRECT or not directly:
+                there = moved.wave[path] if path < Path.WALLS else mirrored(after, path)
+                own = waves_heard(after, there, paths.aperture[path], paths.gain[path])
+                total = total + STRENGTH * share * own
+        return total
+
+    def mirrored(after, path):
+        """Where the image is heard, whether or not the lasers see its wall there."""
+        image = PLACE * [1.0, -1.0] + [0.0, 2.0 * WALLS[path - Path.WALLS, 2]]
+        step = image - after.place_m
+        turn = hand * (np.arctan2(step[:, 1], step[:, 0]) - after.axis_rad) / (2.0 * np.pi)
+        return (turn - np.floor(turn)) * evidence.table.waves
+
+    clock, yaw = by_offsets(fit, velocity)
+    later, sooner = (heard_after(side * STEP, 0.0, directly=False) for side in (1, -1))
+    assert relative_error(clock, (later - sooner) / (2.0 * STEP)) < 0.1
+    left, right = (heard_after(0.0, side * STEP, directly=True) for side in (1, -1))
+    assert relative_error(yaw, (left - right) / (2.0 * STEP)) < 0.1
+
+
+def test_scans_change_with_the_directivity(evidence):
+    def heard_with(lobe):
+        fit = SparseFit(evidence, WALLS)
+        return STRENGTH * fit.add(PLACE, HEIGHT_M, Kind.SOURCE, np.array(lobe)).column
+
+    fit, source = sounding(evidence)
+    every = slice(None)
+    for axis, (more, less) in enumerate((((0.05, 0.0), (-0.05, 0.0)), ((0.0, 0.05), (0.0, -0.05)))):
+        expected = (heard_with(more) - heard_with(less)) / 0.1
+        assert relative_error(by_directivity(fit, source, axis, every), expected) < 0.01
+
+
+def test_a_machine_that_faces_the_array_is_louder_there(evidence):
+    fit, even = sounding(evidence)
+    facing = fit.add(PLACE, HEIGHT_M, Kind.SOURCE, np.array([0.0, -0.7]))
+    away = PLACE - evidence.place_m
+    expected = np.exp(0.7 * away[:, 1] / np.hypot(*away.T))
+    there = even.paths.gain[Path.DIRECT] > 0.0
+    ratio = facing.paths.gain[Path.DIRECT][there] / even.paths.gain[Path.DIRECT][there]
+    np.testing.assert_allclose(ratio, expected[there])
