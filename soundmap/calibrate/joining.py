@@ -17,7 +17,7 @@ from soundmap.sensors import ArrayOffsets, MicArray
 TOO_SURE = 1.4
 """Standard deviations of the fit are this much too small, as seen on simulated sites: sound that
 interferes with its reflections errs alike in scans taken near to each other."""
-SYSTEMATIC = np.array([0.001, np.radians(0.2)])
+SYSTEMATIC = np.array([0.001, np.radians(0.28)])
 """What does not grow less the more turns there are [s, rad], microphones that are not quite where
 they are said to be among it; more where the array's beam is wide."""
 AGREEING_SIGMAS = 3.5
