@@ -188,7 +188,7 @@ def refined_offsets(
         With its mount as believed.
     config : Config
     """
-    start = np.array([by_peaks.clock.value, by_peaks.yaw.value])
+    start = np.array(by_peaks.guess or (by_peaks.clock.value, by_peaks.yaw.value))
     if not np.isfinite(start).all():
         return by_peaks
     scan = config.scan
@@ -205,8 +205,9 @@ def refined_offsets(
     by_fit = offsets_by_fit(start, heard_at)
     if by_fit is None:
         return by_peaks
+    told = by_fit.state, by_fit.covariance, by_fit.explained
     bearings = scans.power.shape[1]
-    return joined_offsets(by_peaks, by_fit, array, scan, config.calibrate, bearings=bearings)
+    return joined_offsets(by_peaks, told, array, scan, config.calibrate, bearings=bearings)
 
 
 def _fused(measured: Measured, config: Config, losses: LossLedger) -> tuple[PowerMap, int]:

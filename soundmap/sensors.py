@@ -168,6 +168,8 @@ class ArrayOffsets:
         Fixed places heard there, sources and mirror images, each counted once a stretch.
     why : str
         Why something cannot be told, in a sentence's part; empty if both can.
+    guess : tuple of float, or None
+        Clock [s] and yaw [rad] that fit best where too little was explained to tell them.
     """
 
     clock: Offset
@@ -175,3 +177,4 @@ class ArrayOffsets:
     explained: float
     places: int
     why: str = ""
+    guess: tuple[float, float] | None = None

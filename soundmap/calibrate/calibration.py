@@ -112,7 +112,7 @@ def array_offsets(
         return _nothing(
             f"only {best.explained:.0%} of what was heard comes from fixed places "
             f"({LEAST_EXPLAINED:.0%} is needed)",
-            best.explained,
+            best,
         )
     far = _far_clock(level, way_at, clear, array, scan) if sharp_beam else UNTOLD
     final = drifting_fit(peaks, way_at, clear, far)
@@ -197,6 +197,9 @@ def _stretches(way: Way) -> list[tuple[int, int]]:
     return [spans[index] for index in chosen]
 
 
-def _nothing(why: str, explained: float = 0.0) -> ArrayOffsets:
+def _nothing(why: str, best: BearingFit | None = None) -> ArrayOffsets:
     unknown = Offset(np.nan, np.nan, OffsetVerdict.UNKNOWN)
-    return ArrayOffsets(unknown, unknown, explained, 0, why)
+    if best is None:
+        return ArrayOffsets(unknown, unknown, 0.0, 0, why)
+    clock_s, yaw_rad = best.state.tolist()
+    return ArrayOffsets(unknown, unknown, best.explained, 0, why, guess=(clock_s, yaw_rad))

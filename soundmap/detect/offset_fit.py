@@ -65,7 +65,25 @@ HeardAt = Callable[[float, float], tuple[Evidence, FloatArray]]
 and yaw [rad]."""
 
 
-def offsets_by_fit(start: FloatArray, heard_at: HeardAt) -> tuple[FloatArray, FloatArray] | None:
+@dataclass(frozen=True)
+class FittedOffsets:
+    """Clock and yaw as the fit has them.
+
+    Attributes
+    ----------
+    state : ndarray, shape (2,)
+        Clock [s] and yaw [rad].
+    covariance : ndarray, shape (2, 2)
+    explained : float
+        Share of what was heard, by its square, that components and far field explain.
+    """
+
+    state: FloatArray
+    covariance: FloatArray
+    explained: float
+
+
+def offsets_by_fit(start: FloatArray, heard_at: HeardAt) -> FittedOffsets | None:
     """Clock and yaw by the fit alone.
 
     Parameters
@@ -76,7 +94,7 @@ def offsets_by_fit(start: FloatArray, heard_at: HeardAt) -> tuple[FloatArray, Fl
 
     Returns
     -------
-    state, covariance : ndarray, shapes (2,) and (2, 2)
+    FittedOffsets or None
         None if nothing is told.
     """
     state = start
@@ -98,7 +116,8 @@ def offsets_by_fit(start: FloatArray, heard_at: HeardAt) -> tuple[FloatArray, Fl
         state = state + step
     if np.any(np.abs(step) > SETTLED):
         return None
-    return state, covariance
+    left, heard = (sum(each.energy[index] for each in told) for index in (0, 1))
+    return FittedOffsets(state, covariance, 1.0 - left / heard)
 
 
 @dataclass
@@ -145,7 +164,8 @@ class _Told:
 
     ``information`` (2, 2) and ``pull`` (2,) are of clock and yaw. The step of the fit's unknowns is
     ``alone`` less ``bound`` times that of clock and yaw; places and shares come first, then the
-    directivities (x and y) of ``directed``.
+    directivities (x and y) of ``directed``. ``energy`` is what the fit leaves unexplained of what
+    was heard, and all of it.
     """
 
     information: FloatArray
@@ -154,6 +174,7 @@ class _Told:
     bound: FloatArray
     owners: Sequence[tuple[Component, int]]
     directed: Sequence[Component]
+    energy: tuple[float, float]
 
     def move(self, step: FloatArray) -> None:
         """Places and directivities as such a step of clock and yaw has them."""
@@ -209,7 +230,8 @@ def _told(fit: SparseFit, velocity: FloatArray) -> _Told:
         for field in fields:
             held += [field.held] * (starts[band + 1] - starts[band])
     normal[2:, 2:] += np.diag(held)
-    return _Told(*_eliminated(normal, right), owners, directed)
+    left, heard = (float(np.sum(each**2)) for each in (fit.residual, evidence.heard))
+    return _Told(*_eliminated(normal, right), owners, directed, (left, heard))
 
 
 def _eliminated(

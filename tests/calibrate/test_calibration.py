@@ -142,6 +142,8 @@ def test_without_a_turn_the_clock_cannot_be_told():
 def test_a_source_that_walks_is_not_taken_for_an_error_of_the_array(walk_m_s):
     found = offsets_of(sources=((2.0, -1.5, 12.0),), walk_m_s=walk_m_s)
     assert found.clock.correction == found.yaw.correction == 0.0
+    assert "fixed places" in found.why
+    assert found.guess is not None  # for a fit that may know better
 
 
 def test_too_short_a_run_says_so():

@@ -21,8 +21,8 @@ def by_peaks(clock_s, yaw_deg):
     return ArrayOffsets(Offset(clock_s, 0.006, known), yaw, 0.9, 7)
 
 
-def joined(first, clock_s, yaw_deg, covariance=COVARIANCE, *, mode="correct", scale=1.0):
-    fitted = np.array([clock_s, np.radians(yaw_deg)]), covariance
+def joined(first, clock_s, yaw_deg, *, explained=0.8, mode="correct", scale=1.0):
+    fitted = np.array([clock_s, np.radians(yaw_deg)]), COVARIANCE, explained
     array = MicArray(scale * RING_M, Mount.planar(0.0, 0.0, 0.5, 0.0), None)
     how = array, ScanConfig(), CalibrateConfig(mode=mode)
     return joined_offsets(first, fitted, *how, bearings=120)
@@ -56,3 +56,12 @@ def test_a_small_array_is_less_sure():
     first = by_peaks(0.0, 0.0)
     small, large = (joined(first, 0.0, 0.0, scale=scale) for scale in (0.3, 1.0))
     assert small.yaw.sigma > 2.0 * large.yaw.sigma
+
+
+def test_where_peaks_tell_nothing_a_fit_that_explains_enough_is_believed():
+    unknown = Offset(np.nan, np.nan, OffsetVerdict.UNKNOWN)
+    first = ArrayOffsets(unknown, unknown, 0.5, 0, "too little", guess=(0.04, 0.1))
+    assert joined(first, 0.066, 2.4, explained=0.5) is first
+    found = joined(first, 0.066, 2.4, explained=0.7)
+    assert found.clock.value == 0.066
+    assert (found.clock.verdict, found.why) == (OffsetVerdict.CORRECTED, "")

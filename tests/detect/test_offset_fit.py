@@ -61,17 +61,18 @@ def test_what_a_rough_start_has_wrong_is_found(more, clock_ms, yaw_deg):
     true = 1e-3 * clock_ms, np.radians(yaw_deg)
     told = offsets_by_fit(np.zeros(2), heard_in_room(clock_s=true[0], yaw_rad=true[1], **more))
     assert told is not None
-    (clock, yaw), covariance = told
+    clock, yaw = told.state
     assert 1e3 * clock == pytest.approx(clock_ms, abs=2.5)
     assert np.degrees(yaw) == pytest.approx(yaw_deg, abs=0.25)
-    assert np.all(np.sqrt(np.diag(covariance)) < [0.01, np.radians(1.0)])
+    assert 0.8 < told.explained < 1.0
+    assert np.all(np.sqrt(np.diag(told.covariance)) < [0.01, np.radians(1.0)])
 
 
 def test_a_field_from_above_does_not_pull_the_clock():
     far = [(0.5, 40.0), (2.0, 25.0), (4.0, 30.0)]
     told = offsets_by_fit(np.zeros(2), heard_in_room(far=far, far_aperture=0.79))
     assert told is not None
-    clock, yaw = told[0]
+    clock, yaw = told.state
     assert abs(clock) < 0.0025
     assert abs(yaw) < np.radians(0.25)
 
@@ -79,7 +80,7 @@ def test_a_field_from_above_does_not_pull_the_clock():
 def test_a_place_moves_against_what_the_offsets_explain():
     source = SimpleNamespace(place_m=np.array([1.0, 2.0]))
     nothing, owners = np.zeros(2), [(source, 0), (source, 1)]
-    told = _Told(np.eye(2), nothing, nothing, np.array([[0.0, 1.0], [2.0, 0.0]]), owners, [])
+    told = _Told(np.eye(2), nothing, nothing, np.array([[0.0, 1.0], [2.0, 0.0]]), owners, [], ())
     told.move(np.array([0.01, 0.03]))
     np.testing.assert_allclose(source.place_m, [0.97, 1.98])
 
@@ -88,7 +89,7 @@ def test_directivities_stand_behind_places_and_shares():
     source = SimpleNamespace(place_m=np.zeros(2), directivity=np.zeros(2))
     owners = [(source, 0), (source, 1), (source, Share.ROOM)]
     alone = np.array([0.0, 0.0, 9.0, 0.2, -9.0, 9.0])
-    _Told(np.eye(2), np.zeros(2), alone, np.zeros((6, 2)), owners, [source]).move(np.zeros(2))
+    _Told(np.eye(2), np.zeros(2), alone, np.zeros((6, 2)), owners, [source], ()).move(np.zeros(2))
     np.testing.assert_allclose(source.directivity, [STEP_SHARE * 0.2, -GREATEST_LOBE])
     assert not source.place_m.any()
 
