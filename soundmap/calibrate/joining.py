@@ -21,10 +21,11 @@ SYSTEMATIC = np.array([0.001, np.radians(0.28)])
 """What does not grow less the more turns there are [s, rad], microphones that are not quite where
 they are said to be among it; more where the array's beam is wide."""
 LEAST_EXPLAINED = 0.65
-"""Where peaks tell nothing, a fit is believed that explains at least this share of what was heard:
-on simulated sites 0.67 to 0.73 where all sources stood still, 0.57 at most where all moved."""
+"""Where peaks tell nothing, or something else, a fit is believed that explains at least this share
+of what was heard: on such simulated sites 0.67 to 0.77 where all sources stood still, 0.57 at most
+where all moved."""
 AGREEING_SIGMAS = 3.5
-"""A fit that differs by more from what peaks tell is not believed."""
+"""Estimates that differ by more tell different things."""
 
 
 def joined_offsets(
@@ -36,7 +37,10 @@ def joined_offsets(
     *,
     bearings: int,
 ) -> ArrayOffsets:
-    """Clock and yaw with their verdicts; those by peaks where the fit disagrees with them.
+    """Clock and yaw with their verdicts.
+
+    Where the peaks tell nothing, or both differ, they are those of the fit if it explains enough,
+    else those of the peaks.
 
     Parameters
     ----------
@@ -55,14 +59,12 @@ def joined_offsets(
     blur = beam_blur(array.positions_m, bearings, low_hz=scan.low_hz, high_hz=scan.high_hz)
     sigma = np.sqrt(TOO_SURE**2 * np.diag(covariance) + (blur * SYSTEMATIC) ** 2)
     correct = calibrate.mode == "correct"
-    if by_peaks.guess is not None:
-        if explained < LEAST_EXPLAINED:
-            return by_peaks
-        return judged(fitted, sigma, by_peaks.explained, by_peaks.places, correct=correct)
     peaks = np.array([by_peaks.clock.value, by_peaks.yaw.value])
     peaks_sigma = np.array([by_peaks.clock.sigma, by_peaks.yaw.sigma])
-    if np.any(np.abs(fitted - peaks) > AGREEING_SIGMAS * np.hypot(sigma, peaks_sigma)):
+    apart = np.abs(fitted - peaks) / np.hypot(sigma, peaks_sigma)
+    if np.all(apart < AGREEING_SIGMAS):  # not where the peaks tell nothing
+        weight = sigma**-2 / (sigma**-2 + peaks_sigma**-2)
+        fitted = weight * fitted + (1.0 - weight) * peaks
+    elif explained < LEAST_EXPLAINED:
         return by_peaks
-    weight = sigma**-2 / (sigma**-2 + peaks_sigma**-2)
-    joined = weight * fitted + (1.0 - weight) * peaks
-    return judged(joined, sigma, by_peaks.explained, by_peaks.places, correct=correct)
+    return judged(fitted, sigma, by_peaks.explained, by_peaks.places, correct=correct)

@@ -46,10 +46,12 @@ def test_what_is_clear_is_corrected_unless_it_shall_only_be_told(mode, verdict):
     assert (found.clock.verdict, found.yaw.verdict) == (verdict, verdict)
 
 
-def test_a_fit_that_disagrees_with_the_peaks_is_not_believed():
+@pytest.mark.parametrize(("clock_s", "yaw_deg"), [(0.0, 4.0), (0.04, 0.0)])
+def test_a_fit_that_disagrees_with_the_peaks_is_believed_if_it_explains_enough(clock_s, yaw_deg):
     first = by_peaks(0.0, 0.0)
-    assert joined(first, 0.0, 4.0) is first
-    assert joined(first, 0.04, 0.0) is first
+    assert joined(first, clock_s, yaw_deg, explained=0.5) is first
+    found = joined(first, clock_s, yaw_deg)
+    assert (found.clock.value, found.yaw.value) == (clock_s, np.radians(yaw_deg))
 
 
 def test_a_small_array_is_less_sure():
