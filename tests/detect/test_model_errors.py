@@ -51,3 +51,18 @@ def test_a_source_whose_bearing_is_sure_tells_more(fit):
     )
     turned = next(iter(fit.derivatives([(fit.components[0], 0)], slice(None))))
     assert np.sum(turned * sure.times(turned)) > 2.0 * np.sum(turned * vague.times(turned))
+
+
+@pytest.mark.parametrize(
+    ("path", "errors"),
+    [(Path.DIRECT, ComponentErrors(strength=1.0)), (Path.FLOOR, ComponentErrors(reflection=1.0))],
+    ids=["strength", "reflection"],
+)
+def test_what_may_be_louder_or_not_tells_less(fit, path, errors):
+    usual, free = (
+        Precision(fit.evidence, fit.components, errors=each) for each in (ComponentErrors(), errors)
+    )
+    paths, strength = fit.components[0].paths, fit.components[0].strength
+    heard = waves_heard(fit.evidence, paths.wave[path], paths.aperture[path], paths.gain[path])
+    heard *= strength[fit.evidence.table.part].astype(np.float32)
+    assert np.sum(heard * free.times(heard)) < 0.9 * np.sum(heard * usual.times(heard))
