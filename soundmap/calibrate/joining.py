@@ -14,9 +14,10 @@ from soundmap.config import CalibrateConfig, ScanConfig
 from soundmap.geometry import FloatArray
 from soundmap.sensors import ArrayOffsets, MicArray
 
-TOO_SURE = 1.4
+TOO_SURE, USUALLY_LEFT = 1.4, 0.3
 """Standard deviations of the fit are this much too small, as seen on simulated sites: sound that
-interferes with its reflections errs alike in scans taken near to each other."""
+interferes with its reflections errs alike in scans taken near to each other. If more than the
+second is left unexplained of what was heard, by so much the more."""
 SYSTEMATIC = np.array([0.001, np.radians(0.28)])
 """What does not grow less the more turns there are [s, rad], microphones that are not quite where
 they are said to be among it; more where the array's beam is wide."""
@@ -26,6 +27,8 @@ of what was heard: on such simulated sites 0.67 to 0.77 where all sources stood 
 where all moved."""
 AGREEING_SIGMAS = 3.5
 """Estimates that differ by more tell different things."""
+CORRELATION = 0.5
+"""Of the errors of both, which look at the same scans: whichever is twice as sure says it all."""
 
 
 def joined_offsets(
@@ -57,14 +60,25 @@ def joined_offsets(
     """
     fitted, covariance, explained = by_fit
     blur = beam_blur(array.positions_m, bearings, low_hz=scan.low_hz, high_hz=scan.high_hz)
-    sigma = np.sqrt(TOO_SURE**2 * np.diag(covariance) + (blur * SYSTEMATIC) ** 2)
+    own = TOO_SURE * max((1.0 - explained) / USUALLY_LEFT, 1.0) * np.sqrt(np.diag(covariance))
+    sigma = np.hypot(own, blur * SYSTEMATIC)
     correct = calibrate.mode == "correct"
     peaks = np.array([by_peaks.clock.value, by_peaks.yaw.value])
     peaks_sigma = np.array([by_peaks.clock.sigma, by_peaks.yaw.sigma])
     apart = np.abs(fitted - peaks) / np.hypot(sigma, peaks_sigma)
     if np.all(apart < AGREEING_SIGMAS):  # not where the peaks tell nothing
-        weight = sigma**-2 / (sigma**-2 + peaks_sigma**-2)
+        weight = _weight(own / peaks_sigma)
         fitted = weight * fitted + (1.0 - weight) * peaks
     elif explained < LEAST_EXPLAINED:
         return by_peaks
     return judged(fitted, sigma, by_peaks.explained, by_peaks.places, correct=correct)
+
+
+def _weight(ratio: FloatArray) -> FloatArray:
+    """Best weight of an estimate beside another with errors in its part, by standard deviations.
+
+    ``ratio`` is that of its standard deviation to the other's; microphones that are not where they
+    are said to be err both alike, and have no part in it.
+    """
+    both = 1.0 + ratio**2 - 2.0 * CORRELATION * ratio
+    return np.clip((1.0 - CORRELATION * ratio) / both, 0.0, 1.0)

@@ -44,7 +44,7 @@ from soundmap.memory import give_back
 ROUNDS, STEP_SHARE = 5, 0.8
 """Steps go this share of the way: reflections turn along with what they reflect, so that whole
 ones would go too far."""
-LEAST_SCANS, MOST_SCANS, MOST_REGIONS = 40, 250, 2
+LEAST_SCANS, MOST_SCANS, MOST_REGIONS = 40, 500, 2
 """Of a region so many scans are looked at, and of a large site so many regions."""
 LEAST_GAIN = 300.0
 """The fit grows until no candidate explains more than this, in units of the noise."""

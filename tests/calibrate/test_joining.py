@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -29,13 +31,32 @@ def joined(first, clock_s, yaw_deg, *, explained=0.8, mode="correct", scale=1.0)
 
 
 def test_each_counts_by_what_it_is_sure_of():
+    own = 1.4 * 0.004
     found = joined(by_peaks(0.066, 2.4), 0.060, 2.0)
-    sigma = np.hypot(1.4 * 0.004, 0.001)
-    weight = sigma**-2 / (sigma**-2 + 0.006**-2)
-    assert found.clock.value == pytest.approx(0.066 - 0.006 * weight, abs=1e-5)
+    assert found.clock.value == pytest.approx(0.066 - 0.006 * weight_of(own, 0.006), abs=1e-5)
     assert 2.0 < np.degrees(found.yaw.value) < 2.2
-    assert found.clock.sigma == pytest.approx(sigma, rel=1e-3)  # no surer than the fit alone
+    sigma = np.hypot(own, 0.001)  # no surer than the fit alone
+    assert found.clock.sigma == pytest.approx(sigma, rel=1e-3)
     assert (found.explained, found.places) == (0.9, 7)
+
+
+def weight_of(own, other):
+    """By the covariance of both estimates, half of whose errors are alike: generalised means."""
+    covariance = np.array([[own**2, 0.5 * own * other], [0.5 * own * other, other**2]])
+    inverse = np.linalg.inv(covariance)
+    return inverse.sum(axis=1)[0] / inverse.sum()
+
+
+def test_a_fit_that_is_twice_as_sure_says_it_all():
+    unsure = Offset(0.066, 0.02, OffsetVerdict.NOUGHT)
+    found = joined(replace(by_peaks(0.066, 2.4), clock=unsure), 0.060, 2.0)
+    assert found.clock.value == 0.060
+
+
+def test_a_fit_that_leaves_much_unexplained_is_less_sure_and_counts_less():
+    well, badly = (joined(by_peaks(0.066, 2.4), 0.060, 2.0, explained=e) for e in (0.75, 0.4))
+    assert badly.clock.sigma > 1.8 * well.clock.sigma
+    assert abs(badly.clock.value - 0.066) < abs(well.clock.value - 0.066)
 
 
 @pytest.mark.parametrize(
