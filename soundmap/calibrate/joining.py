@@ -26,7 +26,7 @@ LEAST_EXPLAINED = 0.65
 of what was heard: on such simulated sites 0.67 to 0.77 where all sources stood still, 0.57 at most
 where all moved."""
 AGREEING_SIGMAS = 3.5
-"""Estimates that differ by more tell different things."""
+"""Estimates that are apart by more tell different things."""
 CORRELATION = 0.5
 """Of the errors of both, which look at the same scans: whichever is twice as sure says it all."""
 
@@ -42,7 +42,8 @@ def joined_offsets(
 ) -> ArrayOffsets:
     """Clock and yaw with their verdicts.
 
-    Where the peaks tell nothing, or both differ, they are those of the fit if it explains enough,
+    Where both are apart by more than they should, standard deviations grow by as much. Where the
+    peaks tell nothing, or both differ altogether, they are those of the fit if it explains enough,
     else those of the peaks.
 
     Parameters
@@ -69,6 +70,7 @@ def joined_offsets(
     if np.all(apart < AGREEING_SIGMAS):  # not where the peaks tell nothing
         weight = _weight(own / peaks_sigma)
         fitted = weight * fitted + (1.0 - weight) * peaks
+        sigma = sigma * np.maximum(apart, 1.0)  # the scale factor of the Particle Data Group
     elif explained < LEAST_EXPLAINED:
         return by_peaks
     return judged(fitted, sigma, by_peaks.explained, by_peaks.places, correct=correct)

@@ -59,6 +59,13 @@ def test_a_fit_that_leaves_much_unexplained_is_less_sure_and_counts_less():
     assert abs(badly.clock.value - 0.066) < abs(well.clock.value - 0.066)
 
 
+def test_both_are_less_sure_if_they_are_apart_by_more_than_they_should():
+    near, far = (joined(by_peaks(0.0, 0.0), 0.0, yaw_deg) for yaw_deg in (0.3, 1.5))
+    each = np.hypot(1.4 * 0.2, 0.28)
+    assert np.degrees(near.yaw.sigma) == pytest.approx(each, rel=0.02)
+    assert np.degrees(far.yaw.sigma) == pytest.approx(each * 1.5 / np.hypot(each, 0.4), rel=0.02)
+
+
 @pytest.mark.parametrize(
     ("mode", "verdict"), [("correct", OffsetVerdict.CORRECTED), ("report", OffsetVerdict.CLEAR)]
 )
