@@ -53,6 +53,12 @@ def test_a_fit_that_is_twice_as_sure_says_it_all():
     assert found.clock.value == 0.060
 
 
+def test_a_fit_that_is_not_half_as_sure_says_nothing():
+    sure = Offset(0.066, 0.002, OffsetVerdict.NOUGHT)
+    found = joined(replace(by_peaks(0.066, 2.4), clock=sure), 0.060, 2.0)
+    assert found.clock.value == pytest.approx(0.066, abs=1e-12)
+
+
 def test_a_fit_that_leaves_much_unexplained_is_less_sure_and_counts_less():
     well, badly = (joined(by_peaks(0.066, 2.4), 0.060, 2.0, explained=e) for e in (0.75, 0.4))
     assert badly.clock.sigma > 1.8 * well.clock.sigma
