@@ -30,7 +30,7 @@ from soundmap.detect.significance import Marks, false_alarm_probabilities
 from soundmap.detect.sound_paths import Kind, Path
 from soundmap.detect.sparse_fit import SparseFit
 from soundmap.detect.steadiness import steadiness
-from soundmap.detect.walls import surface_points, wall_lines
+from soundmap.detect.walls import surface_pieces, surface_points, wall_lines
 from soundmap.geometry import CHI_SQUARED_95, FloatArray, Trajectory
 from soundmap.grid import OccupancyGrid
 from soundmap.sensors import MicArray
@@ -119,7 +119,8 @@ def _found(
     if not fit.components:
         return [], []
     stretch = _stretches(evidence)
-    told = _told(fit, _squares(evidence), surface, surface_odds(surface, room))
+    pieces = surface_pieces(surface)
+    told = _told(fit, _squares(evidence), pieces, surface_odds(pieces, room))
     sources = [
         _source(fit, each, stretch)
         for each in _strongest_apart(told)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from soundmap.detect.walls import HIT_CELL_M
+from soundmap.detect.walls import HIT_CELL_M, PIECES
 from soundmap.geometry import FloatArray
 from soundmap.grid import OccupancyGrid
 
@@ -67,15 +67,15 @@ def placement(
     covariance_m2 : ndarray, shape (2, 2)
         Of that place [m^2].
     surface_m : ndarray, shape (H, 2)
-        Points of surfaces, one for each `HIT_CELL_M` of them [m].
+        Points of surfaces, `PIECES` for each `HIT_CELL_M` of them [m].
     odds : ndarray, shape (H,)
         How much likelier a source is on a metre of each than on a square metre of the open.
 
     Examples
     --------
-    >>> wall = np.column_stack([np.full(50, 2.0), 0.04 * np.arange(50)])
+    >>> wall = np.column_stack([np.full(400, 2.0), 0.005 * np.arange(400)])
     >>> along_x = np.diag([0.1, 0.01]) ** 2
-    >>> placement(np.array([1.9, 1.0]), along_x, wall, np.full(50, 9.0)).place_m.round(2).tolist()
+    >>> placement(np.array([1.9, 1.0]), along_x, wall, np.full(400, 9.0)).place_m.round(2).tolist()
     [2.0, 1.0]
     """
     open_covariance = covariance_m2 + LEAST_SIGMA_M**2 * np.eye(2)
@@ -84,7 +84,7 @@ def placement(
     step = step[near]
     precision = np.linalg.inv(open_covariance)
     away = np.einsum("hi,ij,hj->h", step, precision, step)
-    weight = HIT_CELL_M * odds[near] * np.exp(-0.5 * away)
+    weight = HIT_CELL_M / PIECES * odds[near] * np.exp(-0.5 * away)
     in_open = 2.0 * np.pi * np.sqrt(np.linalg.det(open_covariance))
     total = float(weight.sum())
     if total <= 0.0:

@@ -11,6 +11,10 @@ from soundmap.geometry import FloatArray
 HIT_CELL_M = 0.04
 """Laser hits within such a cell are one point of a surface."""
 LEAST_HITS = 3
+PIECES = 8
+"""Surfaces are told by points this many times finer than cells."""
+NEIGHBOURS, BESIDE_CELLS = 7, 2.5
+"""Points that tell the direction of a surface: at most so many, at most so many cells away."""
 SURFACE_REACH_M = 9.0
 HITS_AT_ONCE = 2000
 MOST_WALLS = 12
@@ -40,6 +44,45 @@ def surface_points(evidence: Evidence) -> FloatArray:
         sums = _sums(np.concatenate([sums, hits]), index.ravel(), len(cells))
     often = sums[:, 2] >= LEAST_HITS
     return np.asarray(sums[often, :2] / sums[often, 2:])
+
+
+def surface_pieces(points_m: FloatArray) -> FloatArray:
+    """Points along the surfaces, `PIECES` times finer.
+
+    Where a source is on a surface must not hang on where the cells happen to lie.
+
+    Parameters
+    ----------
+    points_m : ndarray, shape (H, 2)
+        As `surface_points` gives them.
+
+    Returns
+    -------
+    ndarray, shape (H * PIECES, 2)
+        Evenly along a cell's length of the line through each point and its neighbours; less than
+        that where these lie around it on all sides.
+
+    Examples
+    --------
+    >>> x = np.arange(0.0, 1.0, HIT_CELL_M)
+    >>> pieces = surface_pieces(np.column_stack([x, 2.0 + 0.0 * x]))
+    >>> float(np.diff(pieces[:, 0]).max().round(6)), float(np.ptp(pieces[:, 1]).round(6))
+    (0.005, 0.0)
+    """
+    from scipy.spatial import KDTree
+
+    away, near = KDTree(points_m).query(
+        points_m, k=1 + NEIGHBOURS, distance_upper_bound=BESIDE_CELLS * HIT_CELL_M
+    )
+    told = np.isfinite(away)[..., None]
+    step = np.where(told, points_m[np.where(told[..., 0], near, 0)] - points_m[:, None], 0.0)
+    count = told.sum(axis=1)
+    step = np.where(told, step - step.sum(axis=1, keepdims=True) / count[:, None], 0.0)
+    width, axes = np.linalg.eigh(np.einsum("hni,hnj->hij", step, step))
+    straight = np.sqrt(np.maximum(width[:, 1] - width[:, 0], 0.0) / np.maximum(width[:, 1], 1e-12))
+    along = HIT_CELL_M * ((np.arange(PIECES) + 0.5) / PIECES - 0.5)
+    line = straight[:, None] * axes[:, :, 1]
+    return np.asarray((points_m[:, None] + along[:, None] * line[:, None]).reshape(-1, 2))
 
 
 def _sums(values: FloatArray, index: NDArray[np.intp], count: int) -> FloatArray:

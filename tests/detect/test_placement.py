@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 
 from soundmap.detect.placement import placement
+from soundmap.detect.walls import HIT_CELL_M, surface_pieces
 
-WALL = np.column_stack([np.full(100, 2.0), 0.04 * np.arange(100)])
+WALL = surface_pieces(np.column_stack([np.full(100, 2.0), HIT_CELL_M * np.arange(100)]))
 ALONG_X = np.diag([0.095**2, 0.013**2])
 
 
@@ -29,6 +30,13 @@ def test_a_source_between_is_told_to_be_uncertain():
     assert 1.84 < found.place_m[0] < 2.0
     assert np.sqrt(found.covariance_m2[0, 0]) > 0.06
     assert 0.2 < found.surface_odds < 5.0
+
+
+@pytest.mark.parametrize("along_m", np.linspace(1.0, 1.0 + HIT_CELL_M, 6))
+def test_along_a_surface_a_source_stays_where_its_bearings_meet(along_m):
+    sure = np.diag([0.03**2, 0.004**2])
+    found = placement(np.array([1.97, along_m]), sure, WALL, np.full(len(WALL), 30.0))
+    np.testing.assert_allclose(found.place_m, (2.0, along_m), atol=0.002)
 
 
 def test_without_any_surface_bearings_decide():

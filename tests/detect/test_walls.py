@@ -1,6 +1,6 @@
 import numpy as np
 
-from soundmap.detect.walls import wall_lines
+from soundmap.detect.walls import HIT_CELL_M, surface_pieces, wall_lines
 
 
 def segment(start, end, rng):
@@ -23,3 +23,21 @@ def test_every_wall_of_a_room_is_found_and_a_short_thing_is_not():
 
 def test_too_few_points_make_no_wall():
     assert wall_lines(np.zeros((3, 2))).shape == (0, 3)
+
+
+def test_pieces_fill_a_wall_evenly_whatever_cells_it_crosses():
+    rng = np.random.default_rng(5)
+    wall = segment((0.0, 0.0), (1.5, 2.0), rng)
+    pieces = surface_pieces(wall)
+    along, off = pieces @ np.array([0.6, 0.8]), pieces @ np.array([0.8, -0.6])
+    assert np.abs(off).max() < 0.04
+    held = np.histogram(along, np.arange(0.1, 2.4, 0.02))[0] * HIT_CELL_M
+    assert held.max() < 3.0 * held.mean()
+    assert held.min() > 0.0
+
+
+def test_pieces_of_single_points_stay_with_them():
+    points = np.array([[0.0, 0.0], [3.0, 1.0]])
+    pieces = surface_pieces(points).reshape(2, -1, 2)
+    np.testing.assert_allclose(pieces, np.broadcast_to(points[:, None], pieces.shape))
+    assert surface_pieces(np.zeros((0, 2))).shape == (0, 2)
