@@ -9,8 +9,10 @@ from soundmap.sensors import ArrayOffsets, Offset, OffsetVerdict
 
 USEFUL = np.array([0.015, np.radians(1.5)])
 """Results less certain than this, as a standard deviation, are of no use [s, rad]."""
-CLEAR_SIGMAS = 3.5
-"""Offsets of more standard deviations than this are clear."""
+CLEAR_SIGMAS, LIKELY_SIGMAS = 3.5, 1.0
+"""Offsets of more standard deviations than the first are clear. An array that is clearly off in one
+way is not as it was believed: the other offset is corrected, too, beyond the second, from where on
+the estimate is likely to be the better of both."""
 
 
 def judged(
@@ -28,18 +30,21 @@ def judged(
     correct : bool
         Whether clear offsets are corrected, not only told.
     """
+    clear = np.abs(state) > CLEAR_SIGMAS * sigma
+    known = sigma <= USEFUL
+    corrected = (np.abs(state) > LIKELY_SIGMAS * sigma) & np.any(clear & known) & correct
     clock, yaw = (
-        _offset(float(value), float(spread), float(useful), correct=correct)
-        for value, spread, useful in zip(state, sigma, USEFUL, strict=True)
+        Offset(float(value), float(spread), _verdict(*each))
+        for value, spread, *each in zip(state, sigma, known, corrected, clear, strict=True)
     )
     uncertain = OffsetVerdict.UNKNOWN in (clock.verdict, yaw.verdict)
     why = "turns and sources along the way leave it too uncertain" if uncertain else ""
     return ArrayOffsets(clock, yaw, explained, places, why)
 
 
-def _offset(value: float, sigma: float, useful: float, *, correct: bool) -> Offset:
-    if sigma > useful:
-        return Offset(value, sigma, OffsetVerdict.UNKNOWN)
-    if abs(value) <= CLEAR_SIGMAS * sigma:
-        return Offset(value, sigma, OffsetVerdict.NOUGHT)
-    return Offset(value, sigma, OffsetVerdict.CORRECTED if correct else OffsetVerdict.CLEAR)
+def _verdict(known: bool, corrected: bool, clear: bool) -> OffsetVerdict:
+    if not known:
+        return OffsetVerdict.UNKNOWN
+    if corrected:
+        return OffsetVerdict.CORRECTED
+    return OffsetVerdict.CLEAR if clear else OffsetVerdict.NOUGHT
