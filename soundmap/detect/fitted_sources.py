@@ -11,7 +11,7 @@ one stands near a loud one of the same bearing all along the way.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from soundmap.config import DetectConfig, ScanConfig
 from soundmap.detect.candidates import candidate_places
 from soundmap.detect.component import Component
 from soundmap.detect.evidence import Evidence, gathered_evidence
-from soundmap.detect.growth import grown_fit
+from soundmap.detect.growth import grown_fit, settle
 from soundmap.detect.harmonics import Single
 from soundmap.detect.matched_filter import effective_number
 from soundmap.detect.placement import Placement, placement, surface_odds
@@ -58,11 +58,19 @@ SILENT, UNSTEADY_SHARE = 0.3, 0.35
 class _Told:
     """A component of the fit, and what speaks for it."""
 
-    index: int
     component: Component
     gain: float
     placement: Placement
     probability: float
+
+
+@dataclass(frozen=True)
+class _Ground:
+    """The floor of a region: square of each scan, surfaces, and the odds of a source on them."""
+
+    square: NDArray[np.int64]
+    surface_m: FloatArray
+    odds: FloatArray
 
 
 def fitted_sources(
@@ -118,55 +126,68 @@ def _found(
     fit = grown_fit(evidence, wall_lines(surface), candidates)
     if not fit.components:
         return [], []
-    stretch = _stretches(evidence)
     pieces = surface_pieces(surface)
-    told = _told(fit, _squares(evidence), pieces, surface_odds(pieces, room))
+    ground = _Ground(_squares(evidence), pieces, surface_odds(pieces, room))
+    told = _told(fit, ground)
+    likely = [each for each in told if each.probability <= rate]
+    if not likely:
+        return [], []
+    images = [each.component for each in likely if each.component.kind == Kind.IMAGE]
+    apart = [each for each in _strongest_apart(told) if each.probability <= rate]
+    settle(fit, [*(each.component for each in apart), *images])
+    stretch = _stretches(evidence)
     sources = [
         _source(fit, each, stretch)
-        for each in _strongest_apart(told)
-        if each.probability <= rate
-        and effective_number(each.component.paths.gain[Path.DIRECT]) >= LEAST_EFFECTIVE_SCANS
+        for each in _strongest_apart(_placed_anew(fit, apart, ground))
+        if effective_number(each.component.paths.gain[Path.DIRECT]) >= LEAST_EFFECTIVE_SCANS
         and _reach_m(each.placement) <= VAGUE_M
         and region.owns(each.placement.place_m)
     ]
-    images = [
-        each.component
-        for each in told
-        if each.component.kind == Kind.IMAGE
-        and each.probability <= rate
-        and region.owns(each.component.place_m)
-    ]
-    return sources, images
+    mirrored = [image for image in images if image in fit.components and region.owns(image.place_m)]
+    return sources, mirrored
 
 
-def _told(
-    fit: SparseFit, square: NDArray[np.int64], surface_m: FloatArray, odds: FloatArray
-) -> list[_Told]:
+def _told(fit: SparseFit, ground: _Ground) -> list[_Told]:
     """All components with what speaks for them, those that explain most first."""
     components = fit.components
-    places = [
-        placement(
-            component.place_m,
-            covariance * _erring_alike(component, square),
-            surface_m,
-            odds,
-        )
-        for component, covariance in zip(components, fit.covariances(), strict=True)
-    ]
+    places = _placements(fit, ground)
     noise = max(fit.noise, LEAST_NOISE)
     marks = Marks(
         gain=np.array([fit.gain(index) / noise for index in range(len(components))]),
-        steadiness=steadiness(fit, square),
+        steadiness=steadiness(fit, ground.square),
         surface_odds=np.array([place.surface_odds for place in places]),
         behind_m=np.array([_behind_m(component) for component in components]),
     )
     told = [
-        _Told(index, component, float(gain), place, float(probability))
-        for index, (component, gain, place, probability) in enumerate(
-            zip(components, marks.gain, places, false_alarm_probabilities(marks), strict=True)
+        _Told(component, float(gain), place, float(probability))
+        for component, gain, place, probability in zip(
+            components, marks.gain, places, false_alarm_probabilities(marks), strict=True
         )
     ]
     return sorted(told, key=lambda each: -each.gain)
+
+
+def _placed_anew(fit: SparseFit, told: Sequence[_Told], ground: _Ground) -> list[_Told]:
+    """Those that are still in the fit, where they are now."""
+    places = dict(zip(map(id, fit.components), _placements(fit, ground), strict=True))
+    return [
+        replace(each, placement=places[id(each.component)])
+        for each in told
+        if each.component in fit.components
+    ]
+
+
+def _placements(fit: SparseFit, ground: _Ground) -> list[Placement]:
+    """Where each component stands."""
+    return [
+        placement(
+            component.place_m,
+            covariance * _erring_alike(component, ground.square),
+            ground.surface_m,
+            ground.odds,
+        )
+        for component, covariance in zip(fit.components, fit.covariances(), strict=True)
+    ]
 
 
 def _strongest_apart(told: Sequence[_Told]) -> list[_Told]:
@@ -197,7 +218,7 @@ def _behind_m(component: Component) -> float:
 
 def _source(fit: SparseFit, told: _Told, stretch: NDArray[np.int64]) -> Source:
     component, place = told.component, told.placement.place_m
-    strength, told_of = fit.strengths_along(told.index, stretch)
+    strength, told_of = fit.strengths_along(fit.components.index(component), stretch)
     power = float(component.strength.sum())
     heard = component.paths.gain[Path.DIRECT] > 0.0
     arc = _arc(fit.evidence.place_m[heard], place)

@@ -42,6 +42,9 @@ MERGE_SHARE, JOINT_SHARE = 0.4, 0.1
 """They are, if one in their midst loses less than this share of what the lesser of both gains, or
 of what both gain together: two that share one source gain little each."""
 STEPS = 4
+SETTLED_HEIGHTS_M = (0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0, 1.2, 1.4)
+SETTLING_SHARE = 0.5
+"""Whole steps would swing to and fro by a centimetre."""
 GROWTH_SCANS = 120
 """About as many scans tell where components are; all of them place and weigh these."""
 
@@ -130,6 +133,33 @@ def carried_fit(
     fit.renew()
     fit.move()
     return fit
+
+
+def settle(fit: SparseFit, components: Sequence[Component]) -> None:
+    """Leave only some components in a fit, and let them find their places without the others.
+
+    Ghosts take up what the model leaves of loud sources, in other places after every small change,
+    and what is a source shall not hang on them. Components that are silent then go.
+
+    Parameters
+    ----------
+    fit : SparseFit
+    components : sequence of Component
+        Of the fit.
+    """
+    fit.components = list(components)
+    fit.refit()
+    for _ in range(2):
+        fit.renew()
+        for _ in range(STEPS):
+            fit.move()
+        for component in fit.components:
+            fit.choose_height(component, SETTLED_HEIGHTS_M)
+        fit.refit()
+    for _ in range(2):
+        fit.renew()
+        for _ in range(STEPS):
+            fit.move(share=SETTLING_SHARE)
 
 
 def _bring_into_view(fit: SparseFit) -> None:

@@ -154,21 +154,31 @@ class SparseFit:
             self.components = kept
             self._fit_strengths()
 
-    def move(self, chosen: list[Component] | None = None, *, most_m: float = 0.1) -> None:
-        """One step of some (by default all) components to where bearings point, and a refit."""
+    def move(
+        self,
+        chosen: list[Component] | None = None,
+        *,
+        most_m: float = 0.1,
+        share: float = 1.0,
+    ) -> None:
+        """One step of some (by default all) components to where bearings point, and a refit.
+
+        Reflections turn along with what they reflect, which is left out, so that whole steps go too
+        far in the end.
+        """
         chosen = self.components if chosen is None else chosen
         hessian, gradient, owners = self._system(chosen)
         if not owners:
             return
         scale = np.sqrt(np.diag(hessian)) + 1e-12
         scaled = hessian / np.outer(scale, scale) + 1e-4 * np.eye(len(scale))
-        step = np.linalg.solve(scaled, gradient / scale) / scale
+        step = share * np.linalg.solve(scaled, gradient / scale) / scale
         for position, (component, axis) in enumerate(owners):
             if axis < 2:
                 component.place_m[axis] += np.clip(step[position], -most_m, most_m)
             else:
-                share = component.shares[Share(axis)] + np.clip(step[position], -0.2, 0.2)
-                component.shares[Share(axis)] = float(np.clip(share, LEAST_SHARE, GREATEST_SHARE))
+                taken = component.shares[Share(axis)] + np.clip(step[position], -0.2, 0.2)
+                component.shares[Share(axis)] = float(np.clip(taken, LEAST_SHARE, GREATEST_SHARE))
         for component in {id(owner): owner for owner, _ in owners}.values():
             self._place(component)
         self.refit()

@@ -29,6 +29,18 @@ def test_components_a_hand_apart_are_one_and_others_only_if_that_costs_little(mo
     assert left_of_two(0.6, monkeypatch) == 2
 
 
+def test_a_settled_source_does_not_hang_on_a_ghost_beside_it():
+    evidence = gathered_evidence(*observed([(5.5, 3.1, 20.0)]), ScanConfig())
+    fit = SparseFit(evidence, wall_lines(surface_points(evidence)))
+    source = fit.add(np.array([5.4, 2.95]), 0.6, Kind.SOURCE)
+    fit.add(np.array([5.6, 3.3]), 0.3, Kind.SOURCE)  # together they explain it
+    fit.refit()
+    growth.settle(fit, [source])
+    assert fit.components == [source]
+    np.testing.assert_allclose(source.place_m, (5.5, 3.1), atol=0.02)
+    assert source.height_m == growth.SETTLED_HEIGHTS_M[0]
+
+
 def test_a_high_source_explains_most_at_the_greatest_height():
     evidence = gathered_evidence(*observed([(5.0, 3.1, 20.0)], above_m=1.2), ScanConfig())
     fit = SparseFit(evidence, np.zeros((0, 3)))
