@@ -1,7 +1,8 @@
 r"""From all audio scans of a run to its sources and their mirror images, by a sparse fit.
 
 What a loud source leaves unexplained may look like a weak one. A component of the fit counts as a
-source if such ghosts hardly ever look as much like one: `soundmap.detect.significance`.
+source if such ghosts hardly ever look as much like one: `soundmap.detect.significance`. Sources and
+their mirror images then find their places without the ghosts.
 
 It assumes sources that stand still and sound most of the time, and surfaces that the lasers see.
 It fails where a source moves, where two stand within half a metre of each other, and where a weak
@@ -56,11 +57,16 @@ SILENT, UNSTEADY_SHARE = 0.3, 0.35
 
 @dataclass(frozen=True)
 class _Told:
-    """A component of the fit, and what speaks for it."""
+    """A component of the fit, and what speaks for it.
+
+    ``reach_m`` is the greater half axis of its 95 % ellipse beside all other components, ghosts
+    among them.
+    """
 
     component: Component
     gain: float
     placement: Placement
+    reach_m: float
     probability: float
 
 
@@ -140,7 +146,7 @@ def _found(
         _source(fit, each, stretch)
         for each in _strongest_apart(_placed_anew(fit, apart, ground))
         if effective_number(each.component.paths.gain[Path.DIRECT]) >= LEAST_EFFECTIVE_SCANS
-        and _reach_m(each.placement) <= VAGUE_M
+        and each.reach_m <= VAGUE_M
         and region.owns(each.placement.place_m)
     ]
     mirrored = [image for image in images if image in fit.components and region.owns(image.place_m)]
@@ -159,7 +165,7 @@ def _told(fit: SparseFit, ground: _Ground) -> list[_Told]:
         behind_m=np.array([_behind_m(component) for component in components]),
     )
     told = [
-        _Told(component, float(gain), place, float(probability))
+        _Told(component, float(gain), place, _reach_m(place), float(probability))
         for component, gain, place, probability in zip(
             components, marks.gain, places, false_alarm_probabilities(marks), strict=True
         )
