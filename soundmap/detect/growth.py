@@ -156,10 +156,9 @@ def settle(fit: SparseFit, components: Sequence[Component]) -> None:
         for component in fit.components:
             fit.choose_height(component, SETTLED_HEIGHTS_M)
         fit.refit()
-    for _ in range(2):
-        fit.renew()
-        for _ in range(STEPS):
-            fit.move(share=SETTLING_SHARE)
+    fit.renew()
+    for _ in range(STEPS):
+        fit.move(share=SETTLING_SHARE)
 
 
 def _bring_into_view(fit: SparseFit) -> None:
