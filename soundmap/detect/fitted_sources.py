@@ -187,7 +187,7 @@ def _placements(fit: SparseFit, ground: _Ground) -> list[Placement]:
     """Where each component stands."""
     return [
         placement(
-            component.place_m,
+            component.place_m.copy(),
             covariance * _erring_alike(component, ground.square),
             ground.surface_m,
             ground.odds,

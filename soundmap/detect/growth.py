@@ -44,7 +44,7 @@ of what both gain together: two that share one source gain little each."""
 STEPS = 4
 SETTLED_HEIGHTS_M = (0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0, 1.2, 1.4)
 SETTLING_SHARE = 0.5
-"""Whole steps would swing to and fro by a centimetre."""
+"""Whole steps may swing to and fro by centimetres."""
 GROWTH_SCANS = 120
 """About as many scans tell where components are; all of them place and weigh these."""
 

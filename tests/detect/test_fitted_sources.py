@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from soundmap.config import DetectConfig, ScanConfig
+from soundmap.detect import fitted_sources as module
 from soundmap.detect.fitted_sources import _erring_alike, _loud_side, _squares, fitted_sources
 from tests.detect.box_room import observed
 
@@ -39,6 +40,21 @@ def test_an_image_behind_a_wall_is_told_from_the_source_in_front_of_another():
     found = run([(0.0, 2.5, 30.0), (12.0 - 4.6, 4.9, 8.0)])
     assert len(found) == 1
     assert len(found.reflections) >= 1
+
+
+def test_sources_are_where_they_settle(monkeypatch):
+    hanging = [(3.5, 3.2, 20.0)]
+    (before,) = run(hanging)
+
+    def settle(fit, components):
+        (source,) = fit.components = list(components)
+        source.place_m += (0.3, 0.2)
+        fit.refit()
+
+    monkeypatch.setattr(module, "settle", settle)
+    (after,) = run(hanging)
+    away = after.x_m - before.x_m, after.y_m - before.y_m
+    np.testing.assert_allclose(away, (0.3, 0.2), atol=0.05)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -41,6 +41,17 @@ def test_a_settled_source_does_not_hang_on_a_ghost_beside_it():
     assert source.height_m == growth.SETTLED_HEIGHTS_M[0]
 
 
+def test_a_settled_source_is_at_rest():
+    evidence = gathered_evidence(*observed([(5.5, 3.1, 20.0)]), ScanConfig())
+    fit = SparseFit(evidence, wall_lines(surface_points(evidence)))
+    source = fit.add(np.array([5.5, 3.1]), 0.3, Kind.SOURCE)
+    growth.settle(fit, [source])
+    settled = source.place_m.copy()
+    for _ in range(20):
+        fit.move(share=0.5)
+    np.testing.assert_allclose(settled, source.place_m, atol=0.003)
+
+
 def test_a_high_source_explains_most_at_the_greatest_height():
     evidence = gathered_evidence(*observed([(5.0, 3.1, 20.0)], above_m=1.2), ScanConfig())
     fit = SparseFit(evidence, np.zeros((0, 3)))

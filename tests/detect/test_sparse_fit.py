@@ -131,3 +131,16 @@ def test_the_far_field_is_taken_out_of_the_equations_of_places(before_far_field)
         size_of = scale * np.linalg.norm(column[:, part])
         np.testing.assert_allclose(hessian[:count, count + band] / size_of, across / size_of,
                                    atol=2e-4)  # fmt: skip
+
+
+def test_half_steps_come_to_rest_where_whole_ones_swing():
+    evidence = gathered_evidence(*observed([(5.5, 3.1, 20.0)]), ScanConfig())
+    fit = SparseFit(evidence, wall_lines(surface_points(evidence)))
+    source = fit.add(np.array([5.5, 3.1]), 0.3, Kind.SOURCE)
+    fit.refit()
+    fit.renew()
+    for _ in range(12):
+        fit.move(share=0.5)
+    at_rest = source.place_m.copy()
+    fit.move(share=0.5)
+    np.testing.assert_allclose(source.place_m, at_rest, atol=0.002)
