@@ -43,8 +43,9 @@ MERGE_SHARE, JOINT_SHARE = 0.4, 0.1
 of what both gain together: two that share one source gain little each."""
 STEPS = 4
 SETTLED_HEIGHTS_M = (0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0, 1.2, 1.4)
+"""Heights between array and source among which sources that settle choose."""
 SETTLING_SHARE = 0.5
-"""Whole steps may swing to and fro by centimetres."""
+"""Their last steps: whole ones may swing to and fro by centimetres."""
 GROWTH_SCANS = 120
 """About as many scans tell where components are; all of them place and weigh these."""
 

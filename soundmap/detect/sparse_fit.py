@@ -163,8 +163,8 @@ class SparseFit:
     ) -> None:
         """One step of some (by default all) components to where bearings point, and a refit.
 
-        Reflections turn along with what they reflect, which is left out, so that whole steps go too
-        far in the end.
+        Only a ``share`` of the step is taken: reflections turn along with what they reflect, which
+        is left out, so that whole ones may go too far in the end.
         """
         chosen = self.components if chosen is None else chosen
         hessian, gradient, owners = self._system(chosen)
