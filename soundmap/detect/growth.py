@@ -68,9 +68,7 @@ def grown_fit(evidence: Evidence, walls: FloatArray, candidates: Candidates) -> 
     _bring_into_view(fit)
     for _ in range(STEPS):
         fit.move()
-    for component in fit.components:
-        fit.choose_height(component, HEIGHTS_TRIED_M)
-    fit.refit()
+    _choose_heights(fit, HEIGHTS_TRIED_M)
     fit.move()
     fit.renew()
     return fit
@@ -154,12 +152,16 @@ def settle(fit: SparseFit, components: Sequence[Component]) -> None:
         fit.renew()
         for _ in range(STEPS):
             fit.move()
-        for component in fit.components:
-            fit.choose_height(component, SETTLED_HEIGHTS_M)
-        fit.refit()
+        _choose_heights(fit, SETTLED_HEIGHTS_M)
     fit.renew()
     for _ in range(STEPS):
         fit.move(share=SETTLING_SHARE)
+
+
+def _choose_heights(fit: SparseFit, heights_m: tuple[float, ...]) -> None:
+    for component in fit.components:
+        fit.choose_height(component, heights_m)
+    fit.refit()
 
 
 def _bring_into_view(fit: SparseFit) -> None:
