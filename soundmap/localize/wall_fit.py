@@ -12,6 +12,7 @@ from soundmap.config import LocalizeConfig
 from soundmap.geometry import FloatArray, transformed
 from soundmap.grid import OccupancyGrid
 from soundmap.localize.map_fit import map_surface, point_pull
+from soundmap.localize.registration import registered
 from soundmap.localize.smoothing import ScanEvidence
 from soundmap.localize.views import Views
 from soundmap.localize.wall_lines import has_line, line_pull, wall_lines
@@ -70,7 +71,7 @@ class WallFit:
         if not by_lines:
             return lambda at: _borne_out(*by_map(at))
         placed = (part for _, part in _placed(pose, points_m, first, counts))
-        lines = wall_lines(self._surface, placed)
+        lines = registered(self._surface, wall_lines(self._surface, placed))
         for own, part in _placed(pose, points_m, first, counts):
             share[own[has_line(self._surface, lines, part)]] = MAP_SHARE
 
