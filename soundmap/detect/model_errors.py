@@ -27,6 +27,7 @@ import numpy as np
 
 from soundmap.detect.evidence import Evidence
 from soundmap.detect.harmonics import Single
+from soundmap.detect.inversion import invert
 from soundmap.detect.sound_paths import Path, Paths, waves_heard
 from soundmap.geometry import FloatArray
 from soundmap.side_by_side import side_by_side
@@ -195,7 +196,8 @@ def _inverse(modes: list[Single], size: int, alone: Single) -> Single:
     else:
         covariance = np.zeros((len(alone), size, size), dtype=np.float32)
     covariance[:, np.arange(size), np.arange(size)] += 1.0 + alone
-    return np.asarray(np.linalg.inv(covariance), dtype=np.float32)
+    invert(covariance)
+    return covariance
 
 
 def _modes(
