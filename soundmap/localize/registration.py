@@ -28,7 +28,9 @@ INDEPENDENCE = 0.2
 SEARCH_CELLS = (0.8, 0.4, 0.2)
 """Half-widths of the grids of shifts that are tried in turn, about the best so far [cells] ..."""
 STEPS = 4
-"""... with this many steps each way; the cells' edges are as soft as a grid is coarse."""
+"""... with this many steps each way."""
+SOFT_STEPS = 1.6
+"""The cells' edges are at least as soft as this many steps of a grid."""
 MOST_CELLS = 1000
 """Of the cells of a large map, every so many serve."""
 
@@ -74,7 +76,7 @@ def _mean_shift(
     likelihood = np.logaddexp(np.log1p(-STRAY_SHARE) + log_ndtr(table), np.log(STRAY_SHARE / 3.0))
     shift = np.zeros(3)
     for width_m in search_m:
-        sigma_m = EDGE_SIGMA_M * width_m / search_m[-1]
+        sigma_m = max(EDGE_SIGMA_M, SOFT_STEPS * width_m / STEPS)
         tried = shift + width_m * grid
         within = (reach_m - np.abs(off_m - tried @ slope.T)) / sigma_m
         score = weight * np.interp(within, table, likelihood).sum(axis=1)
