@@ -128,6 +128,7 @@ def _explained(
 ) -> FloatArray:
     scans, bands, classes, waves = match.shape
     explained = np.zeros((len(places), len(heights)))
+    border = (0.5 * (apertures[:-1] + apertures[1:])) ** 2
     for c in prange(len(places)):
         product = np.zeros((len(heights), bands))
         square = np.zeros((len(heights), bands))
@@ -150,14 +151,14 @@ def _explained(
             near = max(distance, NEAREST_M)
             coarse = int(at / COARSE + 0.5) % energy.shape[3]
             for h in range(len(heights)):
-                away = near * near + heights[h] * heights[h]
-                aperture = near / np.sqrt(away)
+                near_by = 1.0 / (near * near + heights[h] * heights[h])
+                aperture_squared = near * near * near_by
                 e = 0
-                while e < classes - 1 and 0.5 * (apertures[e] + apertures[e + 1]) > aperture:
+                while e < classes - 1 and border[e] > aperture_squared:
                     e += 1
                 total = 0.0
                 for b in range(bands):
-                    gain = weight[s, b] / away
+                    gain = weight[s, b] * near_by
                     between = (1.0 - share) * match[s, b, e, left] + share * match[s, b, e, right]
                     own = gain * gain * energy[s, b, 0 if e < 3 else 1, coarse]
                     product[h, b] += gain * between

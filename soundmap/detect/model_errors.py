@@ -138,8 +138,8 @@ class Precision:
         def multiply(few: slice) -> None:
             for band, inverse in enumerate(inverses):
                 own = slice(self.starts[band], self.starts[band + 1])
-                part = np.ascontiguousarray(flat[:, few, own].transpose(1, 2, 0))
-                result[:, few, own] = np.matmul(inverse[few], part).transpose(2, 0, 1)
+                part, into = (each[:, few, own].swapaxes(0, 1) for each in (flat, result))
+                np.matmul(part, inverse[few], out=into)  # it is symmetric
 
         side_by_side(multiply, parts(columns.shape[-2]))
         return out
