@@ -31,6 +31,7 @@ from soundmap.detect.significance import Marks, false_alarm_probabilities
 from soundmap.detect.sound_paths import Kind, Path
 from soundmap.detect.sparse_fit import SparseFit
 from soundmap.detect.steadiness import steadiness
+from soundmap.detect.steps import place_covariances
 from soundmap.detect.walls import surface_pieces, surface_points, wall_lines
 from soundmap.geometry import CHI_SQUARED_95, FloatArray, Trajectory
 from soundmap.grid import OccupancyGrid
@@ -192,7 +193,7 @@ def _placements(fit: SparseFit, ground: _Ground) -> list[Placement]:
             ground.surface_m,
             ground.odds,
         )
-        for component, covariance in zip(fit.components, fit.covariances(), strict=True)
+        for component, covariance in zip(fit.components, place_covariances(fit), strict=True)
     ]
 
 

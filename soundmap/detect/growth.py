@@ -20,6 +20,7 @@ from soundmap.detect.matched_filter import (
 from soundmap.detect.relocation import relocate
 from soundmap.detect.sound_paths import Kind, Path
 from soundmap.detect.sparse_fit import SparseFit
+from soundmap.detect.steps import choose_height, move
 from soundmap.geometry import FloatArray
 
 LEAST_GAIN = 100.0
@@ -67,9 +68,9 @@ def grown_fit(evidence: Evidence, walls: FloatArray, candidates: Candidates) -> 
     fit.renew()
     _bring_into_view(fit)
     for _ in range(STEPS):
-        fit.move()
+        move(fit)
     _choose_heights(fit, HEIGHTS_TRIED_M)
-    fit.move()
+    move(fit)
     fit.renew()
     return fit
 
@@ -111,8 +112,8 @@ def rough_fit(
             fit.add(candidate.place_m, float(HEIGHTS_M[int(np.argmax(value))]), candidate.kind)
         fit.refit()
         fit.renew()
-        fit.move()
-        fit.move()
+        move(fit)
+        move(fit)
         if len(fit.components) >= MOST_COMPONENTS:
             break
     return fit
@@ -130,7 +131,7 @@ def carried_fit(
         joined.strength = component.strength
         joined.shares.update(component.shares)
     fit.renew()
-    fit.move()
+    move(fit)
     return fit
 
 
@@ -151,16 +152,16 @@ def settle(fit: SparseFit, components: Sequence[Component]) -> None:
     for _ in range(2):
         fit.renew()
         for _ in range(STEPS):
-            fit.move()
+            move(fit)
         _choose_heights(fit, SETTLED_HEIGHTS_M)
     fit.renew()
     for _ in range(STEPS):
-        fit.move(share=SETTLING_SHARE)
+        move(fit, share=SETTLING_SHARE)
 
 
 def _choose_heights(fit: SparseFit, heights_m: tuple[float, ...]) -> None:
     for component in fit.components:
-        fit.choose_height(component, heights_m)
+        choose_height(fit, component, heights_m)
     fit.refit()
 
 
@@ -183,7 +184,7 @@ def _bring_into_view(fit: SparseFit) -> None:
         if effective_number(source.paths.gain[Path.DIRECT]) > LEAST_SCANS:
             fit.refit()
             for _ in range(STEPS):
-                fit.move([source])
+                move(fit, [source])
             if source in fit.components and fit.misfit - before < (1.0 - IN_VIEW_SHARE) * worth:
                 continue
         fit.components = kept
@@ -208,7 +209,7 @@ def _merge(fit: SparseFit) -> None:
         joint = fit.add(middle, louder.height_m, louder.kind)
         fit.refit()
         for _ in range(STEPS):
-            fit.move([joint])
+            move(fit, [joint])
         away = float(np.hypot(*(first.place_m - second.place_m)))
         is_worse = away > SURELY_ONE_M and fit.misfit - before > may_lose
         if is_worse or joint not in fit.components:

@@ -36,7 +36,8 @@ from soundmap.detect.model_errors import ComponentErrors, Precision, parts
 from soundmap.detect.offset_derivatives import by_directivity, by_offsets
 from soundmap.detect.regions import Region, regions, telling
 from soundmap.detect.sound_paths import Kind
-from soundmap.detect.sparse_fit import HOLD, SparseFit
+from soundmap.detect.sparse_fit import SparseFit
+from soundmap.detect.steps import HOLD, derivatives, unknowns
 from soundmap.detect.walls import surface_points, wall_lines
 from soundmap.geometry import FloatArray
 from soundmap.memory import give_back
@@ -198,7 +199,7 @@ def _told(fit: SparseFit, velocity: FloatArray) -> _Told:
     del fit.precision  # it is large, and the next one, too
     precision = Precision(evidence, fit.components, fit.far_heard, ERRORS)
     offsets = by_offsets(fit, velocity)
-    owners = fit.unknowns(fit.components)
+    owners = unknowns(fit.components)
     directed = [each for each, axis in owners if axis == 0 and each.kind == Kind.SOURCE]
     first = 2 + len(owners) + 2 * len(directed)
     far = [
@@ -210,7 +211,7 @@ def _told(fit: SparseFit, velocity: FloatArray) -> _Told:
     normal, right = np.zeros((ends[-1], ends[-1])), np.zeros(ends[-1])
     for scans in parts(len(evidence)):
         lobes = [by_directivity(fit, each, axis, scans) for each in directed for axis in (0, 1)]
-        common = np.stack([*offsets[:, scans], *fit.derivatives(owners, scans), *lobes])
+        common = np.stack([*offsets[:, scans], *derivatives(fit, owners, scans), *lobes])
         for band, (start, stop) in enumerate(pairwise(starts)):
             own = np.stack([each.column[scans, start:stop] for each in fit.components])
             waves = [each.columns(scans).transpose(2, 0, 1) for each in far[band]]

@@ -24,6 +24,7 @@ from soundmap.detect.matched_filter import (
 )
 from soundmap.detect.sound_paths import Kind
 from soundmap.detect.sparse_fit import SparseFit
+from soundmap.detect.steps import move
 from soundmap.geometry import FloatArray
 
 WITHIN_M = 2.5
@@ -69,7 +70,7 @@ def _relocate(fit: SparseFit, component: Component, places_m: FloatArray, energy
     fit.components = [each for each in kept if each is not component]
     fit.add(place, float(HEIGHTS_M[int(np.argmax(value))]), Kind.SOURCE)
     fit.refit()
-    fit.move()
+    move(fit)
     if component.kind == Kind.SOURCE and fit.misfit > before:
         fit.components = kept
         fit.refit()

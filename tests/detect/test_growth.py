@@ -6,6 +6,7 @@ from soundmap.detect.evidence import gathered_evidence
 from soundmap.detect.matched_filter import HEIGHTS_M, explained, matched_scans
 from soundmap.detect.sound_paths import Kind
 from soundmap.detect.sparse_fit import SparseFit
+from soundmap.detect.steps import move
 from soundmap.detect.walls import surface_points, wall_lines
 from tests.detect.box_room import observed
 
@@ -48,7 +49,7 @@ def test_a_settled_source_is_at_rest():
     growth.settle(fit, [source])
     settled = source.place_m.copy()
     for _ in range(20):
-        fit.move(share=0.5)
+        move(fit, share=0.5)
     np.testing.assert_allclose(settled, source.place_m, atol=0.003)
 
 

@@ -11,6 +11,7 @@ from soundmap.detect.evidence import gathered_evidence
 from soundmap.detect.model_errors import ComponentErrors, Precision
 from soundmap.detect.sound_paths import Kind, Path, waves_heard
 from soundmap.detect.sparse_fit import SparseFit
+from soundmap.detect.steps import derivatives
 from tests.detect.box_room import observed
 
 
@@ -49,7 +50,7 @@ def test_a_source_whose_bearing_is_sure_tells_more(fit):
         Precision(fit.evidence, fit.components, errors=ComponentErrors(bearing=error))
         for error in (0.2, 0.02)
     )
-    turned = next(iter(fit.derivatives([(fit.components[0], 0)], slice(None))))
+    turned = next(iter(derivatives(fit, [(fit.components[0], 0)], slice(None))))
     assert np.sum(turned * sure.times(turned)) > 2.0 * np.sum(turned * vague.times(turned))
 
 
