@@ -52,8 +52,9 @@ STRETCH_M = 0.5
 ONE_SIDE_RAD = np.radians(40.0)
 LOUD_SIDE = 0.75
 """Share of all that is told of a source that makes it no louder than along its axis."""
-SILENT, UNSTEADY_SHARE = 0.3, 0.35
-"""A source is unsteady if it has less than this share of its strength in so much of what tells."""
+SILENT, UNSTEADY_SHARE = 0.3, 0.25
+"""A source is unsteady if it has less than this share of its strength in so much of what tells: on
+random scenes one steady source of a hundred, but each place that a talker walks past."""
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """The fit of sources to scans from a rectangular room."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -55,6 +56,19 @@ def test_sources_are_where_they_settle(monkeypatch):
     (after,) = run(hanging)
     away = after.x_m - before.x_m, after.y_m - before.y_m
     np.testing.assert_allclose(away, (0.3, 0.2), atol=0.05)
+
+
+@pytest.mark.parametrize(("silent", "flagged"), [(0, False), (1, False), (4, True), (6, True)])
+def test_a_source_that_sounds_at_times_only_is_unsteady(silent, flagged):
+    """Of each ten seconds, so many are silent."""
+    place = (5.9, 3.1, 20.0)
+    scans, *rest = observed([place])
+    quiet, *_ = observed([(*place[:2], 1e-3)])
+    pause = ((scans.time_ns - scans.time_ns[0]) * 1e-9 % 10.0 < silent)[:, None, None]
+    parts = np.where(pause, quiet.sub_bands, scans.sub_bands)
+    scans = replace(scans, power=parts.sum(axis=1), sub_bands=parts)
+    (source,) = fitted_sources(scans, *rest, ScanConfig(), DetectConfig())
+    assert ("unsteady" in source.fit.flags) == flagged
 
 
 @pytest.mark.parametrize("seed", range(3))
