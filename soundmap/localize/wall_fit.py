@@ -29,7 +29,8 @@ class WallFit:
     """Fits laser points to the walls of a map.
 
     To its cells while the poses are rough; then to the lines that the run's returns draw in them,
-    with a weak pull of the cells, so that lines and poses do not drift together.
+    all lines together laid where they cross their cells. A weak pull of the cells is left, so that
+    lines and poses do not drift together.
     """
 
     def __init__(self, room: OccupancyGrid, config: LocalizeConfig) -> None:
