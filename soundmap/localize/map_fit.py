@@ -88,7 +88,6 @@ def point_pull(
     *,
     sigma_m: float,
     kernel_m: float,
-    whole: float = 1.0,
 ) -> tuple[FloatArray, FloatArray]:
     r"""Normal equations of fitting the points of each pose to the map.
 
@@ -107,13 +106,11 @@ def point_pull(
     first : ndarray of int64, shape (K + 1,)
         Points of pose k are ``points_m[first[k]:first[k + 1]]``.
     share : ndarray, shape (P,)
-        Weight of each point, in parts of ``whole``; what has none does not count.
+        Weight of each point; what has none does not count.
     sigma_m : float
         :math:`\sigma` [m].
     kernel_m : float
         :math:`c` [m]; points farther off than 3 c do not count at all.
-    whole : float, optional
-        The share of a point of full weight: small integers keep a long run's shares small.
 
     Returns
     -------
@@ -128,7 +125,6 @@ def point_pull(
         np.ascontiguousarray(points_m, dtype=np.float32),
         first,
         share,
-        whole,
         sigma_m,
         kernel_m,
     )
@@ -189,7 +185,6 @@ def _point_pull(
     points: NDArray[np.float32],
     first: NDArray[np.int64],
     share: NDArray[Any],
-    whole: float,
     sigma: float,
     kernel: float,
 ) -> tuple[FloatArray, FloatArray]:
@@ -204,7 +199,7 @@ def _point_pull(
         for i in range(first[k], first[k + 1]):
             if share[i] > 0:
                 own[count, 0], own[count, 1] = points[i, 0], points[i, 1]
-                weight[count] = share[i] / whole
+                weight[count] = share[i]
                 count += 1
         add_map_pull(
             information[k],

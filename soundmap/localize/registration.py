@@ -4,7 +4,8 @@ The centre of a cell is not where its surface is, and what it errs by is alike f
 map whose walls lie on the edges of their cells, all on the same side, is off by half a cell however
 many returns are fitted to it. What a cell does say is that the surface crosses it. All lines of the
 run together are moved and turned to where they cross their cells, which the steps of oblique walls
-and walls drawn on different sides bound far more closely than a cell is wide.
+and walls drawn on different sides bound far more closely than a cell is wide. What then still lies
+outside its cell is drawn back a little.
 """
 
 from __future__ import annotations
@@ -33,10 +34,13 @@ SOFT_STEPS = 1.6
 """The cells' edges are at least as soft as this many steps of a grid."""
 MOST_CELLS = 1000
 """Of the cells of a large map, every so many serve."""
+DRAWN_BACK = 0.1
+"""Share of the way to its cell that a line outside it is moved, each time that lines are drawn:
+where a part of a large site drifts, the moves add up; a cell drawn roughly hardly counts."""
 
 
 def registered(surface: Surface, lines: WallLines) -> WallLines:
-    r"""The lines, moved as one rigid figure to where they cross the cells of the map.
+    r"""The lines, moved as one rigid figure to where they cross the cells of the map, or nearly so.
 
     The shift is the posterior mean, under a flat prior, of a likelihood of every cell c with a
     line: :math:`\Phi((h_c - |e_c|) / \sigma)`, with :math:`e_c` how far its line passes from the
@@ -61,7 +65,9 @@ def registered(surface: Surface, lines: WallLines) -> WallLines:
     weight = INDEPENDENCE * len(has) / len(some)
     search_m = surface.resolution_m * np.array(SEARCH_CELLS)
     shift = _mean_shift(slope[some], off_m[some], reach_m[some], weight, search_m)
-    return replace(lines, offset_m=lines.offset_m + slope @ shift)
+    left_m = off_m - slope @ shift
+    outside_m = np.sign(left_m) * np.maximum(np.abs(left_m) - reach_m, 0.0)
+    return replace(lines, offset_m=lines.offset_m + slope @ shift + DRAWN_BACK * outside_m)
 
 
 def _mean_shift(

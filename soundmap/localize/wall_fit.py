@@ -21,16 +21,14 @@ KERNEL_M = 0.15
 """Width of the robust kernel of the points that the map explains [m]."""
 VIEWS_AT_ONCE = 1024
 """Views whose returns are placed at once; bounds the memory of long runs."""
-WHOLE, MAP_SHARE = 10, 1
-"""Weight that the map's own cells keep where the run's returns draw a line in them: a tenth."""
 
 
 class WallFit:
     """Fits laser points to the walls of a map.
 
     To its cells while the poses are rough; then to the lines that the run's returns draw in them,
-    all lines together laid where they cross their cells. A weak pull of the cells is left, so that
-    lines and poses do not drift together.
+    laid where they cross their cells, so that lines and poses do not drift together. Returns that
+    draw no line are still fitted to cells.
     """
 
     def __init__(self, room: OccupancyGrid, config: LocalizeConfig) -> None:
@@ -50,11 +48,11 @@ class WallFit:
         pose : ndarray, shape (K, 3)
             Best poses so far: lines are drawn from there.
         by_lines : bool
-            Fit to lines as well as to cells.
+            Fit to lines where there are any.
         """
         points_m, first = views.end_m, views.first  # as they are: a long run has many
         sigma_m, weight = self._sigma_m, self._independence
-        share = np.where(counts, np.uint8(WHOLE), np.uint8(0))
+        by_cells = counts.copy()
 
         def by_map(at: FloatArray) -> tuple[FloatArray, FloatArray]:
             information, pull = point_pull(
@@ -62,10 +60,9 @@ class WallFit:
                 at,
                 points_m,
                 first,
-                share,
+                by_cells,
                 sigma_m=sigma_m,
                 kernel_m=KERNEL_M,
-                whole=WHOLE,
             )
             return weight * information, weight * pull
 
@@ -74,7 +71,7 @@ class WallFit:
         placed = (part for _, part in _placed(pose, points_m, first, counts))
         lines = registered(self._surface, wall_lines(self._surface, placed))
         for own, part in _placed(pose, points_m, first, counts):
-            share[own[has_line(self._surface, lines, part)]] = MAP_SHARE
+            by_cells[own[has_line(self._surface, lines, part)]] = False
 
         def by_both(at: FloatArray) -> tuple[FloatArray, FloatArray]:
             information, pull = line_pull(

@@ -2,9 +2,9 @@
 
 A cell of the map says only that a surface is somewhere within 5 cm. The laser returns of the whole
 run say where: those about each surface cell are fitted by a short line, and poses are then matched
-to the lines instead of the cells. The lines of a run and its poses could still drift together, so
-the map keeps a weak pull of its own (surface elements as in Biber and Strasser, "The normal
-distributions transform", IROS 2003).
+to the lines instead of the cells (surface elements as in Biber and Strasser, "The normal
+distributions transform", IROS 2003). The lines of a run and its poses could still drift together,
+so the lines are laid in the cells again: `soundmap.localize.registration`.
 """
 
 from __future__ import annotations

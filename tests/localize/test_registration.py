@@ -84,6 +84,20 @@ def test_a_roughly_drawn_map_moves_lines_by_millimetres():
     assert np.abs(rigid_shift(lines, registered(surface, lines), surface)[:2]).max() < 0.006
 
 
+def test_a_part_of_a_site_that_has_drifted_is_drawn_back_to_its_cells():
+    """A piece of one wall lies seven centimetres outside."""
+    points = surfaces([WALLS])
+    points[:, 1] += 0.02  # through the middle of cells
+    surface = drawn(points)
+    drifted = (points[:, 1] > 3.9) & (points[:, 0] > 2.0) & (points[:, 0] < 4.0)
+    lines = lines_of(surface, points + drifted[:, None] * [0.0, 0.07])
+    top, x = surface.centre_m[:, 1] > 3.9, surface.centre_m[:, 0]
+    moved_m = (registered(surface, lines).offset_m - lines.offset_m) * lines.normal[:, 1]
+    piece, rest = np.abs(x - 3.0) < 0.7, (x > 0.5) & (x < 5.5) & (np.abs(x - 3.0) > 1.3)
+    back_m = np.median(moved_m[top & piece]) - np.median(moved_m[top & rest])
+    assert back_m == pytest.approx(-0.0035, abs=0.0007)  # a tenth of what is outside
+
+
 def test_nothing_is_moved_along_a_single_wall():
     points = np.column_stack([np.linspace(0.0, 5.0, 1000), np.full(1000, 1.02)])
     surface = drawn(points)

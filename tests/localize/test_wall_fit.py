@@ -158,10 +158,9 @@ def test_points_far_from_every_wall_do_not_pull():
 def test_points_that_do_not_count_are_as_if_they_were_not_there():
     surface, keep = map_surface(ROOM), np.random.default_rng(6).random(len(FLAT)) < 0.6
     first = np.concatenate([[0], np.cumsum(keep)])[FIRST]
-    tenths = np.where(keep, np.uint8(1), np.uint8(0))
     kernel = {"sigma_m": 0.05, "kernel_m": 0.15}
-    some = point_pull(surface, POSES, FLAT, FIRST, tenths, whole=10, **kernel)
-    alone = point_pull(surface, POSES, FLAT[keep], first, np.full(keep.sum(), 0.1), **kernel)
+    some = point_pull(surface, POSES, FLAT, FIRST, keep, **kernel)
+    alone = point_pull(surface, POSES, FLAT[keep], first, np.ones(keep.sum()), **kernel)
     assert np.array_equal(some[0], alone[0])
     assert np.array_equal(some[1], alone[1])
     lines = wall_lines(surface, [transformed(np.repeat(POSES, np.diff(FIRST), axis=0), FLAT)])
