@@ -54,7 +54,8 @@ LOUD_SIDE = 0.75
 """Share of all that is told of a source that makes it no louder than along its axis."""
 SILENT, UNSTEADY_SHARE = 0.3, 0.25
 """A source is unsteady if it has less than this share of its strength in so much of what tells: on
-random scenes one steady source of a hundred, but each place that a talker walks past."""
+random scenes one steady source of a hundred, but each place on the way of someone who walks to and
+fro, talking."""
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,9 @@
 import numpy as np
 
 from soundmap.config import ScanConfig
+from soundmap.detect.evidence import gathered_evidence
+from soundmap.detect.sparse_fit import SparseFit
+from soundmap.detect.walls import surface_points, wall_lines
 from soundmap.geometry import Mount, Trajectory
 from soundmap.sensors import MicArray
 from soundmap.sound import AudioScans, LevelReference
@@ -11,6 +14,8 @@ WIDTH, DEPTH = 6.0, 5.0
 ANGLE = 2.0 * np.pi * np.arange(16) / 16
 POSITIONS = np.stack([0.155 * np.cos(ANGLE), 0.155 * np.sin(ANGLE), 0.0 * ANGLE], axis=-1)
 MOUNT = Mount.planar(0.1, 0.0, 0.5, 0.3)
+FAR = ((0.3, 0.8), (1.9, 0.5), (4.4, 0.7))
+"""Bearings of a far field, and the power from there."""
 
 
 def way(speed_m_s=0.3):
@@ -89,3 +94,9 @@ def observed(
         sub_band_hz=ScanConfig().sub_band_hz,
     )
     return scans, np.array(ranges, np.float32), track, MicArray(POSITIONS, MOUNT, None)
+
+
+def begun_fit(emitters, **more):
+    """A fit to what was observed of some emitters, still without components."""
+    evidence = gathered_evidence(*observed(emitters, **more), ScanConfig())
+    return SparseFit(evidence, wall_lines(surface_points(evidence)))

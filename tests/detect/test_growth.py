@@ -7,8 +7,7 @@ from soundmap.detect.matched_filter import HEIGHTS_M, explained, matched_scans
 from soundmap.detect.sound_paths import Kind
 from soundmap.detect.sparse_fit import SparseFit
 from soundmap.detect.steps import move
-from soundmap.detect.walls import surface_points, wall_lines
-from tests.detect.box_room import observed
+from tests.detect.box_room import begun_fit, observed
 
 
 def left_of_two(apart_m, monkeypatch):
@@ -16,8 +15,7 @@ def left_of_two(apart_m, monkeypatch):
     monkeypatch.setattr(growth, "MERGE_SHARE", 0.0)
     monkeypatch.setattr(growth, "JOINT_SHARE", 0.0)
     places = [(5.5, 3.1), (5.5, 3.1 + apart_m)]
-    evidence = gathered_evidence(*observed([(*place, 20.0) for place in places]), ScanConfig())
-    fit = SparseFit(evidence, wall_lines(surface_points(evidence)))
+    fit = begun_fit([(*place, 20.0) for place in places])
     for place in places:
         fit.add(np.array(place), 0.3, Kind.SOURCE)
     fit.renew()
@@ -31,8 +29,7 @@ def test_components_a_hand_apart_are_one_and_others_only_if_that_costs_little(mo
 
 
 def test_a_settled_source_does_not_hang_on_a_ghost_beside_it():
-    evidence = gathered_evidence(*observed([(5.5, 3.1, 20.0)]), ScanConfig())
-    fit = SparseFit(evidence, wall_lines(surface_points(evidence)))
+    fit = begun_fit([(5.5, 3.1, 20.0)])
     source = fit.add(np.array([5.4, 2.95]), 0.6, Kind.SOURCE)
     fit.add(np.array([5.6, 3.3]), 0.3, Kind.SOURCE)  # together they explain it
     fit.refit()
@@ -43,8 +40,7 @@ def test_a_settled_source_does_not_hang_on_a_ghost_beside_it():
 
 
 def test_a_settled_source_is_at_rest():
-    evidence = gathered_evidence(*observed([(5.5, 3.1, 20.0)]), ScanConfig())
-    fit = SparseFit(evidence, wall_lines(surface_points(evidence)))
+    fit = begun_fit([(5.5, 3.1, 20.0)])
     source = fit.add(np.array([5.5, 3.1]), 0.3, Kind.SOURCE)
     growth.settle(fit, [source])
     settled = source.place_m.copy()

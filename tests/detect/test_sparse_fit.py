@@ -4,19 +4,14 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from soundmap.config import ScanConfig
-from soundmap.detect.evidence import gathered_evidence
 from soundmap.detect.far_field import USUAL
 from soundmap.detect.model_errors import Precision
 from soundmap.detect.sound_paths import Kind
-from soundmap.detect.sparse_fit import SparseFit
-from soundmap.detect.walls import surface_points, wall_lines
-from tests.detect.box_room import observed
+from tests.detect.box_room import FAR, begun_fit
 
 
 def test_a_component_that_no_scan_hears_goes():
-    evidence = gathered_evidence(*observed([(5.5, 3.1, 20.0)]), ScanConfig())
-    fit = SparseFit(evidence, wall_lines(surface_points(evidence)))
+    fit = begun_fit([(5.5, 3.1, 20.0)])
     fit.add(np.array([5.5, 3.1]), 0.3, Kind.SOURCE)
     fit.add(np.array([40.0, 40.0]), 0.3, Kind.IMAGE)
     fit.refit()
@@ -24,12 +19,10 @@ def test_a_component_that_no_scan_hears_goes():
 
 
 def test_the_misfit_is_that_of_sources_and_far_field_fitted_together():
-    far = [(0.3, 0.8), (1.9, 0.5), (4.4, 0.7)]
-    evidence = gathered_evidence(*observed([(5.5, 3.1, 20.0)], far=far), ScanConfig())
-    fit = SparseFit(evidence, wall_lines(surface_points(evidence)))
+    fit = begun_fit([(5.5, 3.1, 20.0)], far=FAR)
     components = [fit.add(np.array(place), 0.3, Kind.SOURCE) for place in [(5.5, 3.1), (2.0, 4.8)]]
     fit.refit()
-    misfit = 0.0
+    evidence, misfit = fit.evidence, 0.0
     for band, (start, stop) in enumerate(pairwise(evidence.table.starts)):
         heard = evidence.heard[:, start:stop].ravel().astype(np.float64)
         unit = np.eye(int(evidence.table.starts[-1]))[start:stop]
@@ -49,9 +42,7 @@ def test_the_misfit_is_that_of_sources_and_far_field_fitted_together():
 
 @pytest.fixture(scope="module")
 def before_far_field():
-    far = [(0.3, 0.8), (1.9, 0.5), (4.4, 0.7)]
-    evidence = gathered_evidence(*observed([(5.5, 3.1, 20.0)], far=far), ScanConfig())
-    fit = SparseFit(evidence, wall_lines(surface_points(evidence)))
+    fit = begun_fit([(5.5, 3.1, 20.0)], far=FAR)
     fit.add(np.array([5.4, 3.0]), 0.3, Kind.SOURCE)
     fit.refit()
     return fit

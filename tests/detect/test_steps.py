@@ -2,19 +2,14 @@ from itertools import pairwise
 
 import numpy as np
 
-from soundmap.config import ScanConfig
 from soundmap.detect import steps
-from soundmap.detect.evidence import gathered_evidence
 from soundmap.detect.sound_paths import Kind
-from soundmap.detect.sparse_fit import SparseFit
 from soundmap.detect.steps import derivatives, move
-from soundmap.detect.walls import surface_points, wall_lines
-from tests.detect.box_room import WIDTH, observed
+from tests.detect.box_room import FAR, WIDTH, begun_fit
 
 
-def fitted(emitters, x, y):
-    evidence = gathered_evidence(*observed(emitters), ScanConfig())
-    fit = SparseFit(evidence, wall_lines(surface_points(evidence)))
+def fitted(emitters, x, y, **more):
+    fit = begun_fit(emitters, **more)
     component = fit.add(np.array([x, y]), 0.3, Kind.SOURCE)
     fit.renew()
     for _ in range(8):
@@ -37,19 +32,12 @@ def test_a_source_is_held_before_the_wall_that_its_sound_seems_to_come_out_of(mo
 
 
 def test_a_step_that_the_far_field_could_explain_leads_to_the_same_place():
-    far = [(0.3, 0.8), (1.9, 0.5), (4.4, 0.7)]
-    evidence = gathered_evidence(*observed([(5.5, 3.1, 4.0)], far=far), ScanConfig())
-    fit = SparseFit(evidence, wall_lines(surface_points(evidence)))
-    component = fit.add(np.array([5.35, 3.25]), 0.3, Kind.SOURCE)
-    fit.renew()
-    for _ in range(8):
-        move(fit)
+    _, component = fitted([(5.5, 3.1, 4.0)], 5.35, 3.25, far=FAR)
     np.testing.assert_allclose(component.place_m, (5.5, 3.1), atol=0.05)
 
 
 def test_half_steps_come_to_rest_where_whole_ones_swing():
-    evidence = gathered_evidence(*observed([(5.5, 3.1, 20.0)]), ScanConfig())
-    fit = SparseFit(evidence, wall_lines(surface_points(evidence)))
+    fit = begun_fit([(5.5, 3.1, 20.0)])
     source = fit.add(np.array([5.5, 3.1]), 0.3, Kind.SOURCE)
     fit.refit()
     fit.renew()
@@ -61,9 +49,7 @@ def test_half_steps_come_to_rest_where_whole_ones_swing():
 
 
 def test_the_far_field_is_taken_out_of_the_equations_of_places():
-    far = [(0.3, 0.8), (1.9, 0.5), (4.4, 0.7)]
-    evidence = gathered_evidence(*observed([(5.5, 3.1, 20.0)], far=far), ScanConfig())
-    fit = SparseFit(evidence, wall_lines(surface_points(evidence)))
+    fit = begun_fit([(5.5, 3.1, 20.0)], far=FAR)
     fit.add(np.array([5.4, 3.0]), 0.3, Kind.SOURCE)
     fit.refit()
     hessian, _, owners = steps._system(fit, fit.components)
