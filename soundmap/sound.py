@@ -230,7 +230,8 @@ class SourceFit:
     arc_rad : float
         Width of the arc of directions that it was heard from [rad].
     flags : tuple of str
-        ``not_seen_by_laser``, ``reflection_suspected``, ``seen_from_one_side``, ``unsteady``.
+        ``not_seen_by_laser``, ``reflection_suspected``, ``seen_from_one_side``, ``unsteady``,
+        ``moving``.
     level_sigma_db : float or None
         Standard error of the level, from how it scatters along the way [dB]; None if unknown.
     """

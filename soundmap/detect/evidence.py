@@ -42,6 +42,8 @@ class Evidence:
 
     Attributes
     ----------
+    time_s : ndarray, shape (S,)
+        When each was taken, since the first [s].
     place_m : ndarray, shape (S, 2)
         Centre of the array in the map frame [m].
     axis_rad : ndarray, shape (S,)
@@ -63,6 +65,7 @@ class Evidence:
     table : BeamTable
     """
 
+    time_s: FloatArray
     place_m: FloatArray
     axis_rad: FloatArray
     handedness: int
@@ -85,6 +88,7 @@ class Evidence:
     def chosen(self, scans: NDArray[np.int64]) -> Evidence:
         """Some of the scans."""
         return Evidence(
+            self.time_s[scans],
             self.place_m[scans],
             self.axis_rad[scans],
             self.handedness,
@@ -144,7 +148,9 @@ def gathered_evidence(
     weight = np.sqrt(np.minimum(count, LARGEST_WEIGHT))[:, None]
     loudness = uniform_filter1d(_means(mean, group, count), LOUDNESS_SCANS, axis=0, mode="nearest")
     weight = weight / (RELATIVE_NOISE * loudness)
+    time_s = np.asarray((scans.time_ns[chosen] - scans.time_ns[:1]) * 1e-9, dtype=np.float64)
     return Evidence(
+        _means(time_s, group, count),
         _means(place, group, count),
         axis[first] + _means(wrapped_angle(axis - axis[first][group]), group, count),
         array.mount.handedness,

@@ -33,6 +33,7 @@ from soundmap.detect.sparse_fit import SparseFit
 from soundmap.detect.steadiness import steadiness
 from soundmap.detect.steps import place_covariances
 from soundmap.detect.walls import surface_pieces, surface_points, wall_lines
+from soundmap.detect.wandering import is_moving
 from soundmap.geometry import CHI_SQUARED_95, FloatArray, Trajectory
 from soundmap.grid import OccupancyGrid
 from soundmap.sensors import MicArray
@@ -54,8 +55,10 @@ LOUD_SIDE = 0.75
 """Share of all that is told of a source that makes it no louder than along its axis."""
 SILENT, UNSTEADY_SHARE = 0.3, 0.25
 """A source is unsteady if it has less than this share of its strength in so much of what tells: on
-random scenes one steady source of a hundred, but each place on the way of someone who walks to and
-fro, talking."""
+random scenes one steady source of a hundred."""
+MOVING_SHARE = 0.05
+"""What moves is as silent as that in more of what tells than this; eight in nine that stand are
+not, and are not looked at any further."""
 
 
 @dataclass(frozen=True)
@@ -240,8 +243,11 @@ def _source(fit: SparseFit, told: _Told, stretch: NDArray[np.int64]) -> Source:
     if arc < ONE_SIDE_RAD:
         flags.append("seen_from_one_side")
     along = _relative(strength, told_of, component.strength)
-    if _silent_share(*along) > UNSTEADY_SHARE:
+    silent = _silent_share(*along)
+    if silent > UNSTEADY_SHARE:
         flags.append("unsteady")
+    if silent > MOVING_SHARE and is_moving(fit, component):
+        flags.append("moving")
     details = SourceFit(
         power * _loud_side(*along),
         told.placement.covariance_m2,

@@ -83,7 +83,12 @@ def beam_energies(evidence: Evidence, precision: Precision) -> Single:
 
 
 def explained(
-    evidence: Evidence, matched: MatchedScans, places_m: FloatArray, kind: Kind
+    evidence: Evidence,
+    matched: MatchedScans,
+    places_m: FloatArray,
+    kind: Kind,
+    *,
+    least_scans: float = LEAST_SCANS,
 ) -> FloatArray:
     """Misfit that one source at each place would explain, shape (C, heights).
 
@@ -94,6 +99,8 @@ def explained(
     places_m : ndarray, shape (C, 2)
         [m]
     kind : Kind
+    least_scans : float
+        A place that fewer (effective number) tell of explains nothing.
     """
     run = _explained_by_many if len(places_m) >= MANY else _explained_by_few
     return np.asarray(
@@ -101,6 +108,7 @@ def explained(
             np.ascontiguousarray(places_m, dtype=np.float64),
             HEIGHTS_M,
             kind == Kind.IMAGE,
+            least_scans,
             evidence.place_m,
             evidence.axis_rad,
             float(evidence.handedness),
@@ -117,6 +125,7 @@ def _explained(
     places: FloatArray,
     heights: FloatArray,
     behind: bool,
+    least_scans: float,
     stand: FloatArray,
     axis: FloatArray,
     hand: float,
@@ -167,7 +176,7 @@ def _explained(
                 told[h] += total
                 told_twice[h] += total * total
         for h in range(len(heights)):
-            if told[h] * told[h] > LEAST_SCANS * told_twice[h]:
+            if told[h] * told[h] > least_scans * told_twice[h]:
                 for b in range(bands):
                     if product[h, b] > 0.0 and square[h, b] > 0.0:
                         explained[c, h] += product[h, b] * product[h, b] / square[h, b]

@@ -57,32 +57,40 @@ class Outcome:
     sound_s_per_min: float
 
 
-def simulated(seed: int, cache: Path, *, silent: bool, ways: int = 1) -> tuple[Path, Difficulty]:
+def simulated(
+    seed: int, cache: Path, *, silent: bool, ways: int = 1, beside: str | None = None
+) -> tuple[Path, Difficulty]:
     """Folder of a simulated scene, from the cache if it is there."""
-    name = ("s" if silent else "") + str(seed) + ("" if ways == 1 else f"x{ways}")
+    name = ("s" if silent else "") + str(seed) + ("" if ways == 1 else f"x{ways}") + (beside or "")
     folder, notes = cache / name, cache / f"{name}.json"
     if not (folder / "run.mcap").is_file() or not notes.is_file():
-        difficulty = written_scene(seed, cache / f"{name}.toml", silent=silent, ways=ways)
+        difficulty = written_scene(
+            seed, cache / f"{name}.toml", silent=silent, ways=ways, beside=beside
+        )
         simulated_run(cache / f"{name}.toml", folder, force=True)
         notes.write_text(json.dumps(dataclasses.asdict(difficulty)))
     return folder, Difficulty(**json.loads(notes.read_text()))
 
 
-def outcome(folder: Path, difficulty: Difficulty, settings: Path, seed: int) -> Outcome:
-    """A simulated scene processed and judged."""
-    true_way = read_tum(folder / "trajectory.tum")
+def processed(folder: Path, settings: Path, seed: int) -> Run:
+    """A simulated scene as `soundmap process` has it, from a start pose that is off a little."""
     off = np.random.default_rng(seed).normal(0.0, [0.08, 0.08, 0.04])
-    x, y, heading = (float(value) for value in true_way.pose[0] + off)
-    run = process(
+    true_start = read_tum(folder / "trajectory.tum").pose[0]
+    x, y, heading = (float(value) for value in true_start + off)
+    return process(
         folder / "run.mcap",
         folder / "map.yaml",
         loaded_config([settings, folder / "robot.toml"]),
         start_pose=(x, y, heading),
         progress=SilentProgress(),
     )
-    return judged(
-        run, folder / "sources.csv", difficulty, trajectory_error(run.trajectory, true_way)
-    )
+
+
+def outcome(folder: Path, difficulty: Difficulty, settings: Path, seed: int) -> Outcome:
+    """A simulated scene processed and judged."""
+    run = processed(folder, settings, seed)
+    way = trajectory_error(run.trajectory, read_tum(folder / "trajectory.tum"))
+    return judged(run, folder / "sources.csv", difficulty, way)
 
 
 def judged(run: Run, truth_file: Path, difficulty: Difficulty, way: object) -> Outcome:

@@ -26,6 +26,13 @@ ROUTE_CLEARANCE_M = 0.55
 """Least distance of a source from the robot's way."""
 EARSHOT_M = 4.0
 """Every source comes into view within this distance of the way."""
+BESIDE = ("walker", "pauses")
+"""What may be unsteady in a scene: someone walks to and fro and sounds, or one of the machines is
+silent now and then."""
+
+
+class NoRoomError(Exception):
+    """Nobody can walk in a scene without coming too near to the robot."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +60,7 @@ class Difficulty:
 
 
 def random_scene(
-    seed: int, *, silent: bool = False, ways: int = 1
+    seed: int, *, silent: bool = False, ways: int = 1, beside: str | None = None
 ) -> tuple[dict[str, Any], Difficulty]:
     """A scene as a TOML table, and what makes it hard.
 
@@ -64,6 +71,13 @@ def random_scene(
         The same machines stand there, but none of them sounds.
     ways : int
         How many times the robot drives its way, there and back in turn.
+    beside : str, optional
+        One of `BESIDE`.
+
+    Raises
+    ------
+    NoRoomError
+        If nobody can walk there.
     """
     for attempt in range(50):
         drawn = _drawn_scene(np.random.default_rng([seed, attempt]), seed)
@@ -76,14 +90,25 @@ def random_scene(
         table["robot"]["way_points_m"] = way + [point for leg in more for point in leg]
         if silent:
             table["runs"] = [{"name": "run", "sources": []}]
+        rng = np.random.default_rng([seed, 77])
+        if beside == "walker":
+            _add_walker(rng, table)
+        elif beside == "pauses":
+            source = table["sources"][int(rng.integers(len(table["sources"])))]
+            source["on_s"] = round(float(rng.uniform(1.5, 5.0)), 1)
+            source["off_s"] = round(float(rng.uniform(2.0, 6.0)), 1)
         return table, difficulty
     raise RuntimeError(f"seed {seed}: no possible scene in 50 attempts")
 
 
-def written_scene(seed: int, file: Path, *, silent: bool = False, ways: int = 1) -> Difficulty:
+def written_scene(
+    seed: int, file: Path, *, silent: bool = False, ways: int = 1, beside: str | None = None
+) -> Difficulty:
     """Write the first possible scene of a seed, checked by the simulator itself."""
     for offset in range(20):
-        table, difficulty = random_scene(seed + 100_000 * offset, silent=silent, ways=ways)
+        table, difficulty = random_scene(
+            seed + 100_000 * offset, silent=silent, ways=ways, beside=beside
+        )
         file.write_text(tomli_w.dumps(table), encoding="utf-8")
         try:
             loaded_scene(file)
@@ -316,3 +341,37 @@ def _furniture(
                 }
             )
     return things
+
+
+def _add_walker(rng: np.random.Generator, table: dict[str, Any]) -> None:
+    """Someone who walks to and fro where the robot does not come, and what they sound like."""
+    corners = np.array(table["walls"][0]["corners_m"])
+    following = np.roll(corners, -1, axis=0)
+    way = table["robot"]["way_points_m"]
+    route = np.concatenate([np.linspace(a, b, 40) for a, b in pairwise(way)])
+    for _ in range(500):
+        ends = rng.uniform(corners.min(axis=0), corners.max(axis=0), (2, 2))
+        line = np.linspace(*ends, 30)
+        if (
+            1.2 < np.hypot(*(ends[1] - ends[0])) < 5.0
+            and np.all(odd_crossings(line, corners, following))
+            and distance_to_walls(line, corners, following).min() >= 0.4
+            and np.hypot(*(route[:, None] - line[None]).transpose(2, 0, 1)).min() >= 0.5
+            and _in_view(line[15], route, corners, following)
+        ):
+            break
+    else:
+        raise NoRoomError
+    speed = round(float(rng.uniform(0.3, 1.1)), 2)
+    first, last = ([round(float(value), 3) for value in end] for end in ends)
+    table["people"] = [{"name": "walker", "way_points_m": [first, last], "speed_m_s": speed}]
+    table["sources"].append(
+        {
+            "id": "walker",
+            "position_m": [*first, round(float(rng.uniform(0.6, 1.6)), 2)],
+            "way_points_m": [last],
+            "speed_m_s": speed,
+            "level_dba_5cm": round(float(rng.uniform(74.0, 84.0)), 1),
+            "sound": str(rng.choice(["speech_like", "fan", "pump"])),
+        }
+    )

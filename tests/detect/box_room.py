@@ -57,17 +57,19 @@ def observed(
 ):
     """Audio scans, laser ranges, way and array.
 
-    Emitters are x, y and power at 1 m; far are bearings of the map and the power from there.
+    Emitters are x, y and power at 1 m, or functions that tell these at a time [s]; far are bearings
+    of the map and the power from there.
     """
     rng = np.random.default_rng(seed)
     track = way(speed_m_s)
     time_ns = track.time_ns[2:-2:2]
     power, ranges = [], []
-    for pose in track.at(time_ns):
+    for time_s, pose in zip(1e-9 * (time_ns - time_ns[0]), track.at(time_ns), strict=True):
         turn = pose[2] + MOUNT.yaw_rad
         place = pose[:2] + 0.1 * np.array([np.cos(pose[2]), np.sin(pose[2])])
         heard = ambient * np.tile([[0.2], [0.2], [0.3], [0.3]], 120)
-        for x, y, strength in emitters:
+        for emitter in emitters:
+            x, y, strength = emitter(time_s) if callable(emitter) else emitter
             step = np.array([x, y]) - place
             toward, square = np.arctan2(step[1], step[0]) - turn, step @ step
             direct = square + above_m**2

@@ -69,6 +69,16 @@ def test_a_source_that_sounds_at_times_only_is_unsteady(silent, flagged):
     scans = replace(scans, power=parts.sum(axis=1), sub_bands=parts)
     (source,) = fitted_sources(scans, *rest, ScanConfig(), DetectConfig())
     assert ("unsteady" in source.fit.flags) == flagged
+    assert "moving" not in source.fit.flags
+
+
+def test_only_what_is_silent_now_and_then_may_move(monkeypatch):
+    monkeypatch.setattr(module, "is_moving", lambda fit, component: True)
+    place = 5.9, 3.1
+    (steady,) = run([(*place, 20.0)])
+    (other,) = run([lambda time_s: (*place, 20.0 if time_s % 10.0 < 8.0 else 1e-3)])
+    assert "moving" not in steady.fit.flags
+    assert "moving" in other.fit.flags
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -13,6 +13,7 @@ TABLE = BeamTable(np.zeros((1, 1, 0), np.float32), np.zeros(1, np.int64), (), np
 def evidence_at(place):
     count = len(place)
     return Evidence(
+        time_s=np.arange(count, dtype=float),
         place_m=place,
         axis_rad=np.zeros(count),
         handedness=1,

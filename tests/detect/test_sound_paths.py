@@ -31,6 +31,7 @@ def evidence(turn=0.0, axis=0.0):
     with np.errstate(divide="ignore"):
         to_wall = np.where(np.cos(ray) > 0.01, 3.0 / np.cos(ray), np.nan)
     return Evidence(
+        time_s=np.zeros(1),
         place_m=np.zeros((1, 2)),
         axis_rad=np.array([axis]),
         handedness=1,
