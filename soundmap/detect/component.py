@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 
 import numpy as np
+from numpy.typing import NDArray
 
 from soundmap.detect.harmonics import Single
 from soundmap.detect.model_errors import Precision
@@ -52,6 +53,8 @@ class Component:
     directivity : ndarray, shape (2,)
         Toward a unit vector u of the map it sends exp(directivity . u) of its power; the gains of
         its paths have that in them.
+    sounding : ndarray of bool, shape (S,), optional
+        In which scans it does: it may pause. The gains of its paths have that in them.
     ways : dict
         For each `Share` those paths that have it and that any scan hears.
     weighted : ndarray of float32, shape (S, D), optional
@@ -68,6 +71,7 @@ class Component:
     paths: Paths
     column: Single
     directivity: FloatArray = field(default_factory=EVEN.copy)
+    sounding: NDArray[np.bool_] | None = None
     ways: dict[Share, list[int]] = field(default_factory=dict)
     weighted: Single | None = None
     weighted_by: Precision | None = None

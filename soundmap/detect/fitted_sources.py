@@ -55,7 +55,7 @@ LOUD_SIDE = 0.75
 """Share of all that is told of a source that makes it no louder than along its axis."""
 SILENT, UNSTEADY_SHARE = 0.3, 0.25
 """A source is unsteady if it has less than this share of its strength in so much of what tells: on
-random scenes one steady source of a hundred."""
+random scenes one steady source of a hundred. One that pauses is unsteady, too."""
 MOVING_SHARE = 0.05
 """What moves is as silent as that in more of what tells than this; eight in nine that stand are
 not, and are not looked at any further."""
@@ -244,9 +244,9 @@ def _source(fit: SparseFit, told: _Told, stretch: NDArray[np.int64]) -> Source:
         flags.append("seen_from_one_side")
     along = _relative(strength, told_of, component.strength)
     silent = _silent_share(*along)
-    if silent > UNSTEADY_SHARE:
+    if silent > UNSTEADY_SHARE or component.sounding is not None:
         flags.append("unsteady")
-    if silent > MOVING_SHARE and is_moving(fit, component):
+    if silent > MOVING_SHARE and component.sounding is None and is_moving(fit, component):
         flags.append("moving")
     details = SourceFit(
         power * _loud_side(*along),

@@ -17,6 +17,7 @@ from soundmap.detect.matched_filter import (
     explained,
     matched_scans,
 )
+from soundmap.detect.pauses import find_pauses
 from soundmap.detect.relocation import relocate
 from soundmap.detect.sound_paths import Kind, Path
 from soundmap.detect.sparse_fit import SparseFit
@@ -72,6 +73,7 @@ def grown_fit(evidence: Evidence, walls: FloatArray, candidates: Candidates) -> 
     _choose_heights(fit, HEIGHTS_TRIED_M)
     move(fit)
     fit.renew()
+    find_pauses(fit)
     return fit
 
 

@@ -105,6 +105,9 @@ class SparseFit:
         component.paths = self._paths(
             component.place_m, component.height_m, component.kind, component.directivity
         )
+        if component.sounding is not None:
+            gain = component.paths.gain * component.sounding
+            component.paths = replace(component.paths, gain=gain)
         self._hear(component)
 
     def gain(self, index: int) -> float:
