@@ -13,7 +13,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from soundmap.detect.component import Component
 from soundmap.detect.sound_paths import Kind
 from soundmap.detect.sparse_fit import SparseFit
 from soundmap.detect.steps import move
@@ -23,12 +22,13 @@ from soundmap.geometry import FloatArray
 CHANGE = 40.0
 """Price of a change, in units of the noise: chance does not pay it."""
 LEAST_NOISE = 0.5
-LEAST_CHANGES, SHORTEST_S = 4, 1.0
+LEAST_CHANGES, SHORTEST_S = 4, 0.6
 """A machine that pauses is heard to change so often, and to stay as it is for so long."""
 WORTH, LEAST_WORTH = 0.25, 200.0
 """Pauses explain so much more than an even strength does, as a share of that and at least."""
-SPAN_S, OF_FREE = 0.6, 0.6
-"""They explain at least this share of what strengths of their own for such spans would."""
+SPAN_S, OF_FREE, SURE_OF_FREE = 0.6, 0.6, 0.9
+"""They explain at least the first share of what strengths of their own for such spans would. Below
+the second, somebody who walks by again and again may be heard."""
 ROUNDS, MOST = 6, 6
 STEPS = 2
 
@@ -39,19 +39,12 @@ def find_pauses(fit: SparseFit) -> None:
     What one leaves unexplained while it is silent looks like pauses of others: each is looked at
     once those before it are taken.
     """
-    walkers: list[Component] = []
     for _ in range(MOST):
-        told = [
-            (0.0, None) if each in walkers else _states(fit, index)
-            for index, each in enumerate(fit.components)
-        ]
+        told = [_states(fit, index) for index in range(len(fit.components))]
         worth, sounding = max(told, key=lambda each: each[0], default=(0.0, None))
         if sounding is None:
             break
         component = fit.components[[each[0] for each in told].index(worth)]
-        if is_moving(fit, component):
-            walkers.append(component)
-            continue
         component.sounding = sounding
         fit.hear_anew(component)
         fit.refit()
@@ -73,12 +66,14 @@ def _states(fit: SparseFit, index: int) -> tuple[float, NDArray[np.bool_] | None
         return 0.0, None
     sounding = _sounding(match, energy, span)
     changes = int(np.count_nonzero(np.diff(sounding)))
-    worth = _explained(match[sounding], energy[sounding]) - even - CHANGE * changes
+    explained = _explained(match[sounding], energy[sounding])
+    worth = explained - even - CHANGE * changes
     if (
         changes < LEAST_CHANGES
         or worth < max(WORTH * even, LEAST_WORTH)
-        or even + worth < OF_FREE * free
+        or explained < OF_FREE * free
         or _shortest_s(sounding, evidence.time_s) < SHORTEST_S
+        or (explained < SURE_OF_FREE * free and is_moving(fit, component))
     ):
         return 0.0, None
     return worth, sounding
