@@ -41,11 +41,11 @@ def find_pauses(fit: SparseFit) -> None:
     """
     for _ in range(MOST):
         told = [_states(fit, index) for index in range(len(fit.components))]
-        worth, sounding = max(told, key=lambda each: each[0], default=(0.0, None))
-        if sounding is None:
+        best = int(np.argmax([0.0, *(worth for worth, _ in told)])) - 1
+        if best < 0:
             break
-        component = fit.components[[each[0] for each in told].index(worth)]
-        component.sounding = sounding
+        component = fit.components[best]
+        component.sounding = told[best][1]
         fit.hear_anew(component)
         fit.refit()
         fit.renew()
@@ -59,14 +59,14 @@ def _states(fit: SparseFit, index: int) -> tuple[float, NDArray[np.bool_] | None
     if component.kind == Kind.IMAGE or component.sounding is not None:
         return 0.0, None
     match, energy = _told(fit, index)
-    even = _explained(match, energy)
     span = np.unique(np.floor(evidence.time_s / SPAN_S), return_inverse=True)[1].ravel()
-    free = sum(_explained(match[span == one], energy[span == one]) for one in np.unique(span))
+    even = _explained(match.sum(axis=0), energy.sum(axis=0))
+    free = _explained(_in_spans(match, span), _in_spans(energy, span))
     if free < even + max(WORTH * even, LEAST_WORTH):
         return 0.0, None
     sounding = _sounding(match, energy, span)
     changes = int(np.count_nonzero(np.diff(sounding)))
-    explained = _explained(match[sounding], energy[sounding])
+    explained = _explained(match[sounding].sum(axis=0), energy[sounding].sum(axis=0))
     worth = explained - even - CHANGE * changes
     if (
         changes < LEAST_CHANGES
@@ -93,10 +93,14 @@ def _told(fit: SparseFit, index: int) -> tuple[FloatArray, FloatArray]:
     return match.astype(np.float64), energy.astype(np.float64)
 
 
-def _explained(match: FloatArray, energy: FloatArray) -> float:
-    """Misfit that one strength in each sub-band explains of some scans."""
-    product, square = np.maximum(match.sum(axis=0), 0.0), energy.sum(axis=0)
-    return float(np.sum(product**2 / np.maximum(square, 1e-30)))
+def _explained(product: FloatArray, square: FloatArray) -> float:
+    """Misfit that strengths explain, each of so much match and energy."""
+    return float(np.sum(np.maximum(product, 0.0) ** 2 / np.maximum(square, 1e-30)))
+
+
+def _in_spans(told: FloatArray, span: NDArray[np.int64]) -> FloatArray:
+    """Sums of what the scans (S, B) of each span tell, (T, B)."""
+    return np.stack([np.bincount(span, each) for each in told.T], axis=1)
 
 
 def _sounding(match: FloatArray, energy: FloatArray, span: NDArray[np.int64]) -> NDArray[np.bool_]:
