@@ -4,7 +4,7 @@ What a loud source leaves unexplained may look like a weak one. A component of t
 source if such ghosts hardly ever look as much like one: `soundmap.detect.significance`. Sources and
 their mirror images then find their places without the ghosts.
 
-It assumes sources that stand still and sound most of the time, and surfaces that the lasers see.
+It assumes sources that stand still and sound much of the time, and surfaces that the lasers see.
 It fails where a source moves, where two stand within half a metre of each other, and where a weak
 one stands near a loud one of the same bearing all along the way.
 """

@@ -27,9 +27,9 @@ AROUND_M, CELL_M = 2.5, 0.25
 CELLS = round(2.0 * AROUND_M / CELL_M) + 1
 GOES_ABOUT, COMES_AND_GOES = 2.0, 1.5
 """It moves if a way explains more than any place by the first of these factors, and a place more
-than it would with an even sound by the second. On random scenes two in three of the components that
-stand for someone walking do, one in thirteen machines that they walk among, none of 171 machines
-where nobody walks, and two of twenty that are silent now and then."""
+than it would with an even sound by the second. On random scenes three in five of the components
+that stand for someone walking do, one in nine machines that they walk among, and one in eighty
+where nobody walks."""
 
 
 def is_moving(fit: SparseFit, component: Component) -> bool:
