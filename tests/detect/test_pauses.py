@@ -1,9 +1,12 @@
 """Machines that fall silent now and then are louder while they sound than on average."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from soundmap.config import DetectConfig, ScanConfig
+from soundmap.detect import pauses as module
 from soundmap.detect.fitted_sources import fitted_sources
 from soundmap.detect.pauses import CHANGE, SHORTEST_S, _cheapest, _shortest_s, find_pauses
 from soundmap.detect.sound_paths import Kind
@@ -79,3 +82,29 @@ def test_the_shortest_state_lies_between_two_changes():
     states = np.array([1, 0, 0, 0, 1, 1, 1, 1, 1, 0], dtype=bool)
     assert _shortest_s(states, time_s) == pytest.approx(1.5)
     assert _shortest_s(np.ones(10, dtype=bool), time_s) > SHORTEST_S
+
+
+def phases(*lasts_s):
+    """States of scans every 0.1 s, sounding first."""
+    return np.repeat(np.arange(len(lasts_s)) % 2 == 0, np.round(10 * np.array(lasts_s)).astype(int))
+
+
+@pytest.mark.parametrize(
+    ("states", "loudness", "pauses"),
+    [
+        (phases(3.0, 3.0, 3.0, 3.0, 3.0), 50.0, True),
+        (phases(3.0, 3.0, 3.0, 6.0), 50.0, False),  # changes three times
+        (phases(3.0, 3.0, 0.4, 3.0, 3.0), 500.0, False),  # a click
+        (phases(3.0, 3.0, 3.0, 3.0, 3.0), 5.0, False),  # hardly heard
+        (phases(9.0, 0.8, 9.0, 0.8, 9.0), 50.0, False),  # hardly silent
+    ],
+)
+def test_pauses_are_long_many_and_worth_it(monkeypatch, states, loudness, pauses):
+    energy = np.full((len(states), 1), loudness)
+    monkeypatch.setattr(module, "_told", lambda fit, index: (energy * states[:, None], energy))
+    monkeypatch.setattr(module, "is_moving", lambda fit, component: False)
+    component = SimpleNamespace(kind=Kind.SOURCE, sounding=None)
+    evidence = SimpleNamespace(time_s=0.1 * np.arange(len(states)))
+    worth, sounding = module._states(SimpleNamespace(components=[component], evidence=evidence), 0)
+    assert (worth > 0.0) == pauses
+    assert sounding is None or np.array_equal(sounding, states)

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from soundmap.detect.sound_paths import Kind
-from soundmap.detect.wandering import CELL_M, CELLS, SPEED_M_S, _best_way, is_moving
+from soundmap.detect.sparse_fit import SparseFit
+from soundmap.detect.walls import surface_points, wall_lines
+from soundmap.detect.wandering import CELLS, _best_way, is_moving
 from tests.detect.box_room import begun_fit
 
 MACHINE = (5.9, 3.1, 20.0)
@@ -31,17 +33,20 @@ def test_who_walks_moves_what_stands_does_not_be_it_silent_now_and_then(second, 
 
 
 def test_of_a_few_seconds_nothing_is_told():
-    fit = begun_fit([walker], speed_m_s=0.0)  # the robot rests: few spans with many scans each
-    fit.evidence = fit.evidence.chosen(np.arange(3))
-    fit.residual = fit.residual[:3]
-    only = fit.add(np.array([2.4, 4.2]), 0.1, Kind.SOURCE)
-    assert not is_moving(fit, only)
+    whole = begun_fit([MACHINE, walker]).evidence
+    for last_s, moves in ((20.0, True), (7.0, False)):
+        evidence = whole.chosen(np.flatnonzero(whole.time_s < last_s))
+        fit = SparseFit(evidence, wall_lines(surface_points(evidence)))
+        fit.add(np.array(MACHINE[:2]), 0.1, Kind.SOURCE)
+        other = fit.add(np.array([2.4, 4.2]), 0.1, Kind.SOURCE)
+        fit.refit()
+        fit.renew()
+        assert is_moving(fit, other) == moves
 
 
 def test_a_way_is_no_faster_than_someone_walks():
     told = np.zeros((3, CELLS, CELLS))
     told[0, 10, 10] = told[2, 10, 10] = 1.0
-    told[1, 10, 14] = 5.0
-    in_time = 4 * CELL_M / SPEED_M_S
-    for wait_s, most in ((in_time, 7.0), (0.4 * in_time, 5.0)):
+    told[1, 10, 14] = 5.0  # a metre away
+    for wait_s, most in ((0.8, 7.0), (0.3, 5.0)):
         assert _best_way(wait_s * np.arange(3.0), told.reshape(3, -1)) == most
