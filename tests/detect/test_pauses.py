@@ -95,7 +95,7 @@ def phases(*lasts_s):
         (phases(3.0, 3.0, 3.0, 3.0, 3.0), 50.0, True),
         (phases(3.0, 3.0, 3.0, 6.0), 50.0, False),  # changes three times
         (phases(3.0, 3.0, 0.4, 3.0, 3.0), 500.0, False),  # a click
-        (phases(3.0, 3.0, 3.0, 3.0, 3.0), 5.0, False),  # hardly heard
+        (phases(3.0, 3.0, 3.0, 3.0, 3.0), 8.0, False),  # hardly heard
         (phases(9.0, 0.8, 9.0, 0.8, 9.0), 50.0, False),  # hardly silent
     ],
 )
