@@ -22,6 +22,7 @@ from soundmap.geometry import FloatArray
 CHANGE = 40.0
 """Price of a change, in units of the noise: chance does not pay it."""
 LEAST_NOISE = 0.5
+"""That unit is what the fit leaves, but no less than this of what was expected."""
 LEAST_CHANGES, SHORTEST_S = 4, 0.6
 """A machine that pauses is heard to change so often, and to stay as it is for so long."""
 WORTH, LEAST_WORTH = 0.25, 200.0
