@@ -30,26 +30,30 @@ def way(speed_m_s=0.3):
     return Trajectory(time_ns, pose, np.ones(len(pose), dtype=bool))
 
 
+HERTZ = np.arange(1062.5, 6000.0, 125.0)
+WAVENUMBER = 2.0 * np.pi * HERTZ / 343.0
+SUB_BAND = np.searchsorted(ScanConfig().sub_band_hz, HERTZ) - 1
+
+
+def _waves(toward):
+    """Phases at the microphones of waves along the floor, shape (bearings, frequencies, 16)."""
+    toward = np.asarray(toward)[:, None]
+    way = np.cos(toward) * POSITIONS[:, 0] + np.sin(toward) * POSITIONS[:, 1]
+    return np.exp(1j * WAVENUMBER[:, None] * way[:, None])
+
+
+STEER = np.ascontiguousarray(_waves(2.0 * np.pi * np.arange(120) / 120).conj().swapaxes(0, 1)) / 16
+
+
 def response(toward, aperture=1.0):
     """Power of the beamformer's output on 120 bearings for waves from ``toward``, white sound.
 
     Of each sub-band, shape (4, 120).
     """
-    looking = 2.0 * np.pi * np.arange(120) / 120
-    edges = ScanConfig().sub_band_hz
-    total = np.zeros((4, 120))
-    for hertz in np.arange(1062.5, 6000.0, 125.0):
-        k = 2.0 * np.pi * hertz / 343.0
-        wave = np.exp(
-            1j
-            * k
-            * aperture
-            * (np.cos(toward) * POSITIONS[:, 0] + np.sin(toward) * POSITIONS[:, 1])
-        )
-        steer = np.exp(1j * k * (np.outer(np.cos(looking), POSITIONS[:, 0])
-                                 + np.outer(np.sin(looking), POSITIONS[:, 1])))  # fmt: skip
-        total[np.searchsorted(edges, hertz) - 1] += np.abs(steer.conj() @ wave / 16) ** 2
-    return total / 40
+    way = np.cos(toward) * POSITIONS[:, 0] + np.sin(toward) * POSITIONS[:, 1]
+    wave = np.exp(1j * WAVENUMBER[:, None] * aperture * way)
+    power = np.abs(np.einsum("fbm,fm->fb", STEER, wave)) ** 2
+    return np.stack([power[part == SUB_BAND].sum(axis=0) for part in range(4)]) / 40
 
 
 def observed(
