@@ -61,7 +61,7 @@ def test_sources_are_where_they_settle_if_that_is_near(monkeypatch, step, found)
         np.testing.assert_allclose(away, step, atol=0.05)
 
 
-@pytest.mark.parametrize(("silent", "flagged"), [(1, False), (4, True)])
+@pytest.mark.parametrize(("silent", "flagged"), [(0, False), (1, False), (4, True), (6, True)])
 def test_a_source_that_sounds_at_times_only_is_unsteady(silent, flagged):
     """Of each ten seconds, so many are silent."""
     place = (5.9, 3.1, 20.0)
