@@ -28,7 +28,7 @@ from soundmap.detect.placement import Placement, placement, surface_odds
 from soundmap.detect.reflections import is_at_mirror, told_reflections
 from soundmap.detect.regions import Region, regions
 from soundmap.detect.significance import Marks, false_alarm_probabilities
-from soundmap.detect.sound_paths import Kind, Path
+from soundmap.detect.sound_paths import Kind, Path, departures
 from soundmap.detect.sparse_fit import SparseFit
 from soundmap.detect.steadiness import steadiness
 from soundmap.detect.steps import place_covariances
@@ -236,25 +236,27 @@ def _behind_m(component: Component) -> float:
 def _source(fit: SparseFit, told: _Told, stretch: NDArray[np.int64]) -> Source:
     component, place = told.component, told.placement.place_m
     strength, told_of = fit.strengths_along(fit.components.index(component), stretch)
-    power = float(component.strength.sum())
+    power = _power(fit, component)
     heard = component.paths.gain[Path.DIRECT] > 0.0
     arc = _arc(fit.evidence.place_m[heard], place)
     flags = []
     if not told.placement.on_surface:
         flags.append("not_seen_by_laser")
-    louder = [c.place_m for c in fit.components if c.strength.sum() > power]
+    louder = [each.place_m for each in fit.components if _power(fit, each) > power]
     if is_at_mirror(component.place_m, np.reshape(louder, (-1, 2)), fit.walls):
         flags.append("reflection_suspected")
     if arc < ONE_SIDE_RAD:
         flags.append("seen_from_one_side")
     along = _relative(strength, told_of, component.strength)
+    lobe = np.bincount(stretch, _lobe(fit, component)) / np.bincount(stretch)
+    sent = _relative(lobe[:, None] * strength, told_of, component.strength)
     silent = _silent_share(*along)
     if silent > UNSTEADY_SHARE or component.sounding is not None:
         flags.append("unsteady")
     if silent > MOVING_SHARE and component.sounding is None and is_moving(fit, component):
         flags.append("moving")
     details = SourceFit(
-        power * _loud_side(*along),
+        float(component.strength.sum()) * _loud_side(*sent),
         told.placement.covariance_m2,
         told.probability,
         arc,
@@ -262,6 +264,19 @@ def _source(fit: SparseFit, told: _Told, stretch: NDArray[np.int64]) -> Source:
     )
     visits = int(fit.evidence.merged[heard].sum())
     return Source(float(place[0]), float(place[1]), power, visits, details)
+
+
+def _lobe(fit: SparseFit, component: Component) -> FloatArray:
+    """What its directivity makes of a component's strength toward each scan, shape (S,)."""
+    toward = departures(fit.walls, component.place_m, fit.evidence.place_m)[Path.DIRECT]
+    return np.asarray(np.exp(toward @ component.directivity))
+
+
+def _power(fit: SparseFit, component: Component) -> float:
+    """Mean square at 1 m that a component sends to the scans, those that are near before all."""
+    gain = component.paths.gain[Path.DIRECT]
+    even = np.sum(gain / _lobe(fit, component))
+    return float(component.strength.sum() * (gain.sum() / even if even > 0.0 else 1.0))
 
 
 def _squares(evidence: Evidence) -> NDArray[np.int64]:

@@ -17,6 +17,7 @@ from soundmap.detect.matched_filter import (
     explained,
     matched_scans,
 )
+from soundmap.detect.model_errors import FREE_ERRORS
 from soundmap.detect.pauses import find_pauses
 from soundmap.detect.relocation import relocate
 from soundmap.detect.sound_paths import Kind, Path
@@ -141,7 +142,9 @@ def settle(fit: SparseFit, components: Sequence[Component]) -> None:
     """Leave only some components in a fit, and let them find their places without the others.
 
     Ghosts take up what the model leaves of loud sources, in other places after every small change,
-    and what is a source shall not hang on them. Components that are silent then go.
+    and what is a source shall not hang on them. What they took up is left to what may err, and to
+    directivities: what a source sends to one side more than to others looks like something beside
+    it otherwise. Components that are silent then go.
 
     Parameters
     ----------
@@ -150,6 +153,7 @@ def settle(fit: SparseFit, components: Sequence[Component]) -> None:
         Of the fit.
     """
     fit.components = list(components)
+    fit.errors, fit.directed = FREE_ERRORS, True
     fit.refit()
     for _ in range(2):
         fit.renew()

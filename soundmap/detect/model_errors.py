@@ -69,6 +69,10 @@ class ComponentErrors:
 
 
 USUAL_ERRORS = ComponentErrors()
+FREE_ERRORS = ComponentErrors(bearing=0.02, harmonic=1.0, strength=1.0, reflection=1.0)
+"""Strengths and reflections err by their own size, scan by scan, since direct sound interferes with
+what floor and walls reflect: what tells is the shape over the bearings. Each harmonic errs by about
+its own size besides, so that a loud source beside the robot does not outvote all others."""
 
 
 class Sounding(Protocol):

@@ -1,13 +1,12 @@
-"""Offset derivatives: how scans change with the array's clock and yaw, and with directivities."""
+"""Offset derivatives: how scans change with the array's clock and yaw."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from soundmap.detect.component import Component
 from soundmap.detect.harmonics import Single
 from soundmap.detect.model_errors import bearing_derivative
-from soundmap.detect.sound_paths import NEAREST_M, Path, departures, heard_places, waves_heard
+from soundmap.detect.sound_paths import NEAREST_M, Path, heard_places
 from soundmap.detect.sparse_fit import SparseFit
 from soundmap.geometry import FloatArray
 
@@ -42,19 +41,6 @@ def by_offsets(fit: SparseFit, velocity: FloatArray) -> Single:
             passing = _passing(places[path] - evidence.place_m, velocity)
             clock += turned * (passing.astype(np.float32)[:, None] - turn_rate)
     return np.stack([clock, yaw])
-
-
-def by_directivity(fit: SparseFit, component: Component, axis: int, scans: slice) -> Single:
-    """Change of what some scans hear with a component's directivity along x or y, shape (s, D)."""
-    evidence, paths = fit.evidence, component.paths
-    toward = departures(fit.walls, component.place_m, evidence.place_m[scans])[..., axis]
-    change = np.zeros_like(evidence.heard[scans])
-    for path, share in component.taken():
-        gain = share * paths.gain[path, scans] * toward[path]
-        wave, aperture = paths.wave[path, scans], paths.aperture[path, scans]
-        change += waves_heard(evidence, wave, aperture, gain, scans)
-    change *= component.strength[evidence.table.part].astype(np.float32)
-    return change
 
 
 def _passing(step_m: FloatArray, velocity: FloatArray) -> FloatArray:

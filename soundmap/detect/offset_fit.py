@@ -9,10 +9,8 @@ J being its derivative by what the array's clock :math:`\delta` and yaw :math:`\
 shares, strengths, directivities and the far field are unknowns beside those two: in each step all
 are solved for together, and those of the fit eliminated.
 
-Strengths and reflections err by their own size, scan by scan, since direct sound interferes with
-what floor and walls reflect: what tells of :math:`\delta` and :math:`\psi` is the shape over the
-bearings. Each harmonic of a component errs by about its own size besides, so that a loud source
-beside the robot does not outvote all others. Machines radiate less to their backs, and what walls
+What tells of :math:`\delta` and :math:`\psi` is the shape over the bearings: see
+`soundmap.detect.model_errors.FREE_ERRORS`. Machines radiate less to their backs, and what walls
 reflect shows up on other bearings: hence the directivities, of level as a cosine of the direction.
 The late sound of a room arrives from all heights, to which the array's response over the bearings
 differs: the far field is the sum of two such fields.
@@ -28,16 +26,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soundmap.detect.candidates import candidate_places
-from soundmap.detect.component import SHARE_SIGMA, Component, Share
+from soundmap.detect.component import Component
 from soundmap.detect.evidence import Evidence
 from soundmap.detect.far_field import FarFieldBand
 from soundmap.detect.growth import carried_fit, rough_fit
-from soundmap.detect.model_errors import ComponentErrors, Precision, parts
-from soundmap.detect.offset_derivatives import by_directivity, by_offsets
+from soundmap.detect.model_errors import FREE_ERRORS, Precision, parts
+from soundmap.detect.offset_derivatives import by_offsets
 from soundmap.detect.regions import Region, regions, telling
-from soundmap.detect.sound_paths import Kind
 from soundmap.detect.sparse_fit import SparseFit
-from soundmap.detect.steps import HOLD, derivatives, unknowns
+from soundmap.detect.unknowns import Owner, change, derivatives, held, unknowns
 from soundmap.detect.walls import surface_points, wall_lines
 from soundmap.geometry import FloatArray
 from soundmap.memory import give_back
@@ -49,16 +46,11 @@ LEAST_SCANS, MOST_SCANS, MOST_REGIONS = 40, 500, 2
 """Of a region so many scans are looked at, and of a large site so many regions."""
 LEAST_GAIN = 300.0
 """The fit grows until no candidate explains more than this, in units of the noise."""
-ERRORS = ComponentErrors(bearing=0.02, harmonic=1.0, strength=1.0, reflection=1.0)
-DIRECTIVITY_SIGMA = 0.7
-"""Of each component of a directivity: 6 dB from front to back."""
 FAR_APERTURES = 0, 4
 """Of the beam table: waves along the floor, and from 38 degrees above or below."""
 DAMPING = np.array([25.0, 25.0])
 """Information on clock [1/s^2] and yaw [1/rad^2] that damps each step."""
 GREATEST_STEP = np.array([0.03, 0.03])
-GREATEST_MOVE_M, GREATEST_LOBE = 0.1, 0.5
-"""Most that a place and a directivity change in one step."""
 SETTLED = np.array([0.005, np.radians(0.5)])
 """A fit whose last step is greater than this [s, rad] has found nothing."""
 HeardAt = Callable[[float, float], tuple[Evidence, FloatArray]]
@@ -164,44 +156,36 @@ class _Told:
     """What a fit tells of clock and yaw, its own unknowns eliminated.
 
     ``information`` (2, 2) and ``pull`` (2,) are of clock and yaw. The step of the fit's unknowns is
-    ``alone`` less ``bound`` times that of clock and yaw; places and shares come first, then the
-    directivities (x and y) of ``directed``. ``energy`` is what the fit leaves unexplained of what
-    was heard, and all of it.
+    ``alone`` less ``bound`` times that of clock and yaw; those with ``owners`` come first.
+    ``energy`` is what the fit leaves unexplained of what was heard, and all of it.
     """
 
     information: FloatArray
     pull: FloatArray
     alone: FloatArray
     bound: FloatArray
-    owners: Sequence[tuple[Component, int]]
-    directed: Sequence[Component]
+    owners: Sequence[Owner]
     energy: tuple[float, float]
 
     def move(self, step: FloatArray) -> None:
-        """Places and directivities as such a step of clock and yaw has them."""
+        """Places, shares and directivities as such a step of clock and yaw has them."""
         own = STEP_SHARE * self.alone - self.bound @ step
-        count = len(self.owners)
-        for (component, axis), move in zip(self.owners, own[:count], strict=True):
-            if axis < 2:
-                component.place_m[axis] += np.clip(move, -GREATEST_MOVE_M, GREATEST_MOVE_M)
-        lobes = own[count : count + 2 * len(self.directed)].reshape(-1, 2)
-        for component, lobe in zip(self.directed, lobes, strict=True):
-            component.directivity += np.clip(lobe, -GREATEST_LOBE, GREATEST_LOBE)
+        for owner, of_owner in zip(self.owners, own[: len(self.owners)], strict=True):
+            change(owner, float(of_owner))
 
 
 def _told(fit: SparseFit, velocity: FloatArray) -> _Told:
     """Normal equations of clock, yaw and all unknowns of a fit, summed up part by part.
 
-    Clock and yaw come first, then places and shares, then directivities, then for each sub-band the
-    strengths and the harmonics of the far field. The fit is of no use afterwards.
+    Clock and yaw come first, then the unknowns of components, then for each sub-band the strengths
+    and the harmonics of the far field. The fit is of no use afterwards.
     """
     evidence, starts = fit.evidence, fit.evidence.table.starts
     del fit.precision  # it is large, and the next one, too
-    precision = Precision(evidence, fit.components, fit.far_heard, ERRORS)
+    precision = Precision(evidence, fit.components, fit.far_heard, FREE_ERRORS)
     offsets = by_offsets(fit, velocity)
-    owners = unknowns(fit.components)
-    directed = [each for each, axis in owners if axis == 0 and each.kind == Kind.SOURCE]
-    first = 2 + len(owners) + 2 * len(directed)
+    owners = unknowns(fit.components, directed=True)
+    first = 2 + len(owners)
     far = [
         [FarFieldBand(evidence, band, slice(*own), aperture) for aperture in FAR_APERTURES]
         for band, own in enumerate(pairwise(starts))
@@ -210,8 +194,7 @@ def _told(fit: SparseFit, velocity: FloatArray) -> _Told:
     ends = np.cumsum([first, *sizes])
     normal, right = np.zeros((ends[-1], ends[-1])), np.zeros(ends[-1])
     for scans in parts(len(evidence)):
-        lobes = [by_directivity(fit, each, axis, scans) for each in directed for axis in (0, 1)]
-        common = np.stack([*offsets[:, scans], *derivatives(fit, owners, scans), *lobes])
+        common = np.stack([*offsets[:, scans], *derivatives(fit, owners, scans)])
         for band, (start, stop) in enumerate(pairwise(starts)):
             own = np.stack([each.column[scans, start:stop] for each in fit.components])
             waves = [each.columns(scans).transpose(2, 0, 1) for each in far[band]]
@@ -221,18 +204,16 @@ def _told(fit: SparseFit, velocity: FloatArray) -> _Told:
             index = np.r_[:first, ends[band] : ends[band + 1]]
             normal[np.ix_(index, index)] += flat.T @ weighted
             right[index] += weighted.T @ fit.residual[scans, start:stop].ravel()
-    held = [HOLD if axis < 2 else SHARE_SIGMA[Share(axis)] ** -2 for _, axis in owners]
-    held += [DIRECTIVITY_SIGMA**-2] * (2 * len(directed))
-    if directed:
-        lobe = np.concatenate([component.directivity for component in directed])
-        right[first - len(lobe) : first] -= lobe / DIRECTIVITY_SIGMA**2
+    priors = np.array([held(owner) for owner in owners]).reshape(-1, 2)
+    right[2:first] -= priors[:, 0] * priors[:, 1]
+    firmness = [*priors[:, 0]]
     for band, fields in enumerate(far):
-        held += [0.0] * len(fit.components)
+        firmness += [0.0] * len(fit.components)
         for field in fields:
-            held += [field.held] * (starts[band + 1] - starts[band])
-    normal[2:, 2:] += np.diag(held)
+            firmness += [field.held] * (starts[band + 1] - starts[band])
+    normal[2:, 2:] += np.diag(firmness)
     left, heard = (float(np.sum(each**2)) for each in (fit.residual, evidence.heard))
-    return _Told(*_eliminated(normal, right), owners, directed, (left, heard))
+    return _Told(*_eliminated(normal, right), owners, (left, heard))
 
 
 def _eliminated(

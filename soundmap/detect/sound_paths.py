@@ -123,6 +123,18 @@ def heard_places(walls: FloatArray, place_m: FloatArray) -> FloatArray:
     )
 
 
+def mirrors(walls: FloatArray) -> FloatArray:
+    """How `heard_places` move as the source does, shape (P, 2, 2).
+
+    Parameters
+    ----------
+    walls : ndarray, shape (W, 3)
+    """
+    normal = walls[:, :2]
+    turned = np.eye(2) - 2.0 * normal[:, :, None] * normal[:, None]
+    return np.concatenate([np.tile(np.eye(2), (Path.WALLS, 1, 1)), turned])
+
+
 def departures(walls: FloatArray, place_m: FloatArray, stand_m: FloatArray) -> FloatArray:
     """Directions in which sound leaves a source along each path, unit vectors (P, S, 2) in the map.
 

@@ -20,7 +20,7 @@ from soundmap.detect.component import ASSUMED, EVEN, Component, Share
 from soundmap.detect.evidence import Evidence
 from soundmap.detect.far_field import FarField
 from soundmap.detect.harmonics import Single
-from soundmap.detect.model_errors import Precision
+from soundmap.detect.model_errors import USUAL_ERRORS, Precision
 from soundmap.detect.sound_paths import (
     Kind,
     Path,
@@ -44,6 +44,10 @@ class SparseFit:
     evidence : Evidence
     walls : ndarray, shape (W, 3)
     components : list of Component
+    errors : ComponentErrors
+        What the precision takes of them.
+    directed : bool
+        Whether sources may be louder on one side.
     residual : ndarray of float32, shape (S, D)
     precision : Precision
     far_harmonics : ndarray, shape (D,)
@@ -63,6 +67,7 @@ class SparseFit:
     def __init__(self, evidence: Evidence, walls: FloatArray) -> None:
         self.evidence, self.walls = evidence, walls
         self.components: list[Component] = []
+        self.errors, self.directed = USUAL_ERRORS, False
         self.residual = evidence.heard
         self.far_field = FarField(evidence)
         self.far_heard: Single | None = None
@@ -164,7 +169,7 @@ class SparseFit:
         for component in self.components:
             component.weighted = component.weighted_by = component.coupling = None
         del self.precision  # it is large: the next one takes its room
-        self._weigh(Precision(self.evidence, self.components, self.far_heard))
+        self._weigh(Precision(self.evidence, self.components, self.far_heard, self.errors))
         self.refit()
 
     def refit(self) -> None:

@@ -57,12 +57,21 @@ def response(toward, aperture=1.0):
 
 
 def observed(
-    emitters, *, ambient=1.0, above_m=0.0, far=(), far_aperture=1.0, seed=1, speed_m_s=0.3
+    emitters,
+    *,
+    ambient=1.0,
+    above_m=0.0,
+    far=(),
+    far_aperture=1.0,
+    seed=1,
+    speed_m_s=0.3,
+    reflected=0.0,
 ):
     """Audio scans, laser ranges, way and array.
 
-    Emitters are x, y and power at 1 m, or functions that tell these at a time [s]; far are bearings
-    of the map and the power from there.
+    Emitters are x, y and power at 1 m, or functions that tell these at a time [s]; a directivity d
+    may follow, exp(d . u) of the power going toward u. far are bearings of the map and the power
+    from there. Walls reflect a share.
     """
     rng = np.random.default_rng(seed)
     track = way(speed_m_s)
@@ -73,14 +82,15 @@ def observed(
         place = pose[:2] + 0.1 * np.array([np.cos(pose[2]), np.sin(pose[2])])
         heard = ambient * np.tile([[0.2], [0.2], [0.3], [0.3]], 120)
         for emitter in emitters:
-            x, y, strength = emitter(time_s) if callable(emitter) else emitter
-            step = np.array([x, y]) - place
-            toward, square = np.arctan2(step[1], step[0]) - turn, step @ step
-            direct = square + above_m**2
-            heard += strength / direct * response(toward, np.sqrt(square / direct))
-            down = 2.0 * MOUNT.translation_m[2] + above_m  # below a floor that absorbs half
-            aperture = np.sqrt(square / (square + down**2))
-            heard += 0.5 * strength / (square + down**2) * response(toward, aperture)
+            told = emitter(time_s) if callable(emitter) else emitter
+            for x, y, strength in _heard_at(place, *told, reflected=reflected):
+                step = np.array([x, y]) - place
+                toward, square = np.arctan2(step[1], step[0]) - turn, step @ step
+                direct = square + above_m**2
+                heard += strength / direct * response(toward, np.sqrt(square / direct))
+                down = 2.0 * MOUNT.translation_m[2] + above_m  # below a floor that absorbs half
+                aperture = np.sqrt(square / (square + down**2))
+                heard += 0.5 * strength / (square + down**2) * response(toward, aperture)
         for bearing, strength in far:
             heard += strength * response(bearing - turn, far_aperture)
         power.append(heard * (1.0 + 0.02 * rng.standard_normal((4, 120))))
@@ -100,6 +110,17 @@ def observed(
         sub_band_hz=ScanConfig().sub_band_hz,
     )
     return scans, np.array(ranges, np.float32), track, MicArray(POSITIONS, MOUNT, None)
+
+
+def _heard_at(place, x, y, strength, lobe=(0.0, 0.0), *, reflected):
+    """An emitter and, if walls reflect, its images: where, and how loud toward a place."""
+    seems = [(x, y, 1, 1, 1.0)]
+    if reflected:
+        seems += [(image, y, -1, 1, reflected) for image in (-x, 2.0 * WIDTH - x)]
+        seems += [(x, image, 1, -1, reflected) for image in (-y, 2.0 * DEPTH - y)]
+    for at_x, at_y, flip_x, flip_y, share in seems:
+        leaves = (place - (at_x, at_y)) * (flip_x, flip_y)
+        yield at_x, at_y, share * strength * np.exp(leaves @ lobe / np.hypot(*leaves))
 
 
 def begun_fit(emitters, **more):

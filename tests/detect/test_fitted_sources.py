@@ -75,6 +75,19 @@ def test_a_source_that_sounds_at_times_only_is_unsteady(silent, flagged):
     assert "moving" not in source.fit.flags
 
 
+def test_a_source_that_faces_along_its_wall_is_steady_and_as_loud_as_it_is_there():
+    lobe = -2.0
+    scans, around, track, array = observed([(5.9, 3.1, 20.0, (0.0, lobe))], reflected=0.5)
+    (source,) = fitted_sources(scans, around, track, array, ScanConfig(), DetectConfig())
+    np.testing.assert_allclose((source.x_m, source.y_m), (5.9, 3.1), atol=0.03)
+    assert "unsteady" not in source.fit.flags
+    away = track.at(scans.time_ns)[:, :2] - (source.x_m, source.y_m)
+    sent = 20.0 * np.exp(lobe * away[:, 1] / np.hypot(*away.T))
+    assert sent.min() < 0.2 * sent.max()
+    assert 10.0 * np.log10(source.fit.power_1m / sent.max()) == pytest.approx(0.0, abs=1.0)
+    assert sent.min() < source.power < sent.max()
+
+
 def test_only_what_is_silent_now_and_then_may_move(monkeypatch):
     monkeypatch.setattr(module, "is_moving", lambda fit, component: True)
     place = 5.9, 3.1

@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 
 from soundmap.config import ScanConfig
 from soundmap.detect import growth
@@ -47,6 +48,16 @@ def test_a_settled_source_is_at_rest():
     for _ in range(20):
         move(fit, share=0.5)
     np.testing.assert_allclose(settled, source.place_m, atol=0.003)
+
+
+@pytest.mark.parametrize("lobe", [(0.2, -1.0), (-0.8, -0.3), (-0.3, 0.9)])
+def test_a_settled_source_knows_which_side_of_it_is_loud(lobe):
+    fit = begun_fit([(5.5, 3.1, 20.0, lobe)], reflected=0.5)
+    source = fit.add(np.array([5.4, 3.0]), 0.3, Kind.SOURCE)
+    fit.refit()
+    growth.settle(fit, [source])
+    np.testing.assert_allclose(source.place_m, (5.5, 3.1), atol=0.02)
+    np.testing.assert_allclose(source.directivity, lobe, atol=0.25)
 
 
 def test_a_high_source_explains_most_at_the_greatest_height():

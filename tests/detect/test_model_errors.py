@@ -11,7 +11,7 @@ from soundmap.detect.evidence import gathered_evidence
 from soundmap.detect.model_errors import ComponentErrors, Precision
 from soundmap.detect.sound_paths import Kind, Path, waves_heard
 from soundmap.detect.sparse_fit import SparseFit
-from soundmap.detect.steps import derivatives
+from soundmap.detect.unknowns import derivatives
 from tests.detect.box_room import observed
 
 

@@ -1,4 +1,4 @@
-"""Changes with clock, yaw and directivity, against differences of what the fit predicts."""
+"""Changes with clock and yaw, against differences of what the fit predicts."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from soundmap.config import ScanConfig
 from soundmap.detect.component import Share
 from soundmap.detect.evidence import gathered_evidence
-from soundmap.detect.offset_derivatives import by_directivity, by_offsets
+from soundmap.detect.offset_derivatives import by_offsets
 from soundmap.detect.sound_paths import Kind, Path, sound_paths, waves_heard
 from soundmap.detect.sparse_fit import SparseFit
 from tests.detect.box_room import DEPTH, observed
@@ -76,25 +76,3 @@ def test_scans_change_with_clock_and_yaw_as_the_array_moves(evidence, hand):
     assert relative_error(clock, (later - sooner) / (2.0 * STEP)) < 0.1
     left, right = (heard_after(0.0, side * STEP, directly=True) for side in (1, -1))
     assert relative_error(yaw, (left - right) / (2.0 * STEP)) < 0.1
-
-
-def test_scans_change_with_the_directivity(evidence):
-    def heard_with(lobe):
-        fit = SparseFit(evidence, WALLS)
-        return STRENGTH * fit.add(PLACE, HEIGHT_M, Kind.SOURCE, np.array(lobe)).column
-
-    fit, source = sounding(evidence)
-    every = slice(None)
-    for axis, (more, less) in enumerate((((0.05, 0.0), (-0.05, 0.0)), ((0.0, 0.05), (0.0, -0.05)))):
-        expected = (heard_with(more) - heard_with(less)) / 0.1
-        assert relative_error(by_directivity(fit, source, axis, every), expected) < 0.01
-
-
-def test_a_machine_that_faces_the_array_is_louder_there(evidence):
-    fit, even = sounding(evidence)
-    facing = fit.add(PLACE, HEIGHT_M, Kind.SOURCE, np.array([0.0, -0.7]))
-    away = PLACE - evidence.place_m
-    expected = np.exp(0.7 * away[:, 1] / np.hypot(*away.T))
-    there = even.paths.gain[Path.DIRECT] > 0.0
-    ratio = facing.paths.gain[Path.DIRECT][there] / even.paths.gain[Path.DIRECT][there]
-    np.testing.assert_allclose(ratio, expected[there])

@@ -12,13 +12,13 @@ from soundmap.config import ScanConfig
 from soundmap.detect.component import Share
 from soundmap.detect.evidence import gathered_evidence, velocities
 from soundmap.detect.offset_fit import (
-    GREATEST_LOBE,
     MOST_SCANS,
     STEP_SHARE,
     _some,
     _Told,
     offsets_by_fit,
 )
+from soundmap.detect.unknowns import LOBE, PLACE
 from tests.detect.box_room import observed
 
 SOURCES = ((6.0, 3.0, 50.0), (2.5, 0.0, 15.0), (0.0, 3.5, 30.0))
@@ -80,17 +80,19 @@ def test_a_field_from_above_does_not_pull_the_clock():
 def test_a_place_moves_against_what_the_offsets_explain():
     source = SimpleNamespace(place_m=np.array([1.0, 2.0]))
     nothing, owners = np.zeros(2), [(source, 0), (source, 1)]
-    told = _Told(np.eye(2), nothing, nothing, np.array([[0.0, 1.0], [2.0, 0.0]]), owners, [], ())
+    told = _Told(np.eye(2), nothing, nothing, np.array([[0.0, 1.0], [2.0, 0.0]]), owners, ())
     told.move(np.array([0.01, 0.03]))
     np.testing.assert_allclose(source.place_m, [0.97, 1.98])
 
 
-def test_directivities_stand_behind_places_and_shares():
-    source = SimpleNamespace(place_m=np.zeros(2), directivity=np.zeros(2))
-    owners = [(source, 0), (source, 1), (source, Share.ROOM)]
-    alone = np.array([0.0, 0.0, 9.0, 0.2, -9.0, 9.0])
-    _Told(np.eye(2), np.zeros(2), alone, np.zeros((6, 2)), owners, [source], ()).move(np.zeros(2))
-    np.testing.assert_allclose(source.directivity, [STEP_SHARE * 0.2, -GREATEST_LOBE])
+def test_shares_and_directivities_move_with_the_places():
+    shares = {Share.ROOM: 0.5}
+    source = SimpleNamespace(place_m=np.zeros(2), directivity=np.zeros(2), shares=shares)
+    owners = [(source, axis) for axis in (*PLACE, Share.ROOM, *LOBE)]
+    alone = np.array([0.0, 0.0, 0.1, 0.2, -0.1, 9.0])  # the last is a strength's
+    _Told(np.eye(2), np.zeros(2), alone, np.zeros((6, 2)), owners, ()).move(np.zeros(2))
+    np.testing.assert_allclose(source.directivity, [STEP_SHARE * 0.2, STEP_SHARE * -0.1])
+    assert shares[Share.ROOM] == pytest.approx(0.5 + STEP_SHARE * 0.1)
     assert not source.place_m.any()
 
 

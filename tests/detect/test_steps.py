@@ -4,7 +4,8 @@ import numpy as np
 
 from soundmap.detect import steps
 from soundmap.detect.sound_paths import Kind
-from soundmap.detect.steps import derivatives, move
+from soundmap.detect.steps import move
+from soundmap.detect.unknowns import derivatives
 from tests.detect.box_room import FAR, WIDTH, begun_fit
 
 
