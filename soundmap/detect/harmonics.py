@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -58,6 +59,12 @@ class BeamTable:
     def waves(self) -> int:
         """M, directions of the waves."""
         return self.beams.shape[1]
+
+    @cached_property
+    def turned(self) -> Single:
+        """Change of the beams with the direction of the wave, shape (E, M, D) [1/rad]."""
+        after, before = np.roll(self.beams, -1, axis=1), np.roll(self.beams, 1, axis=1)
+        return np.asarray((after - before) * np.float32(self.waves / (4.0 * np.pi)))
 
     @property
     def part(self) -> NDArray[np.int64]:

@@ -28,7 +28,7 @@ import numpy as np
 from soundmap.detect.evidence import Evidence
 from soundmap.detect.harmonics import Single
 from soundmap.detect.inversion import invert
-from soundmap.detect.sound_paths import Path, Paths, waves_heard
+from soundmap.detect.sound_paths import Path, Paths, paths_heard, waves_heard
 from soundmap.geometry import FloatArray
 from soundmap.side_by_side import side_by_side
 
@@ -239,8 +239,4 @@ def bearing_derivative(
     evidence: Evidence, paths: Paths, scans: slice = slice(None), *, path: int = Path.DIRECT
 ) -> Single:
     """Change of what is heard along a path with the bearing, shape (S, D) [1/rad]."""
-    wave, aperture = paths.wave[path, scans], paths.aperture[path, scans]
-    step = 2.0 * np.pi / evidence.table.waves
-    gain = paths.gain[path, scans] / (2.0 * step)
-    after = waves_heard(evidence, wave + 1.0, aperture, gain, scans)
-    return after - waves_heard(evidence, wave - 1.0, aperture, gain, scans)
+    return paths_heard(evidence, paths, [path], np.ones((1, 1, 1)), scans, turned=True)[0]

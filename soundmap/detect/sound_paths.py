@@ -12,6 +12,7 @@ on the same bearing, so that one wave stands for all of such a family.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -259,17 +260,58 @@ def waves_heard(
     scans : slice, optional
         Which they are.
     """
-    out = np.zeros((len(wave), evidence.heard.shape[1]), dtype=np.float32)
-    turn = evidence.turn_rad[scans] / (2.0 * np.pi) * evidence.table.waves
+    return _sums_of_waves(evidence, wave[None], aperture[None], gain[None, None], scans, False)[0]
+
+
+def paths_heard(
+    evidence: Evidence,
+    paths: Paths,
+    chosen: Sequence[int],
+    share: FloatArray,
+    scans: slice = slice(None),
+    *,
+    turned: bool = False,
+) -> Single:
+    """What some paths of a source of strength 1 add to some scans together, shape (K, S, D).
+
+    Parameters
+    ----------
+    evidence : Evidence
+    paths : Paths
+    chosen : sequence of int, length P
+        Which of them.
+    share : ndarray, shape (K, P, S) or one that broadcasts to it
+        How much of each path's gain K sums have.
+    scans : slice, optional
+    turned : bool
+        The change of that with the paths' bearings instead [1/rad].
+    """
+    index = list(chosen)
+    gain = paths.gain[index, scans]
+    gain = np.ascontiguousarray(np.broadcast_to(share * gain, (len(share), *gain.shape)))
+    wave, aperture = paths.wave[index, scans], paths.aperture[index, scans]
+    return _sums_of_waves(evidence, wave, aperture, gain, scans, turned)
+
+
+def _sums_of_waves(
+    evidence: Evidence,
+    wave: FloatArray,
+    aperture: FloatArray,
+    gain: FloatArray,
+    scans: slice,
+    turned: bool,
+) -> Single:
+    out = np.zeros((len(gain), gain.shape[2], evidence.heard.shape[1]), dtype=np.float32)
+    table = evidence.table
     _add_waves(
         out,
-        evidence.table.beams,
-        evidence.table.starts,
+        table.turned if turned else table.beams,
+        table.starts,
         APERTURES,
         wave,
         aperture,
         gain,
-        turn,
+        evidence.turn_rad[scans] / (2.0 * np.pi) * table.waves,
         evidence.weight[scans],
     )
     return out
@@ -287,40 +329,47 @@ def _add_waves(
     turn: FloatArray,
     weight: FloatArray,
 ) -> None:
-    """Beams interpolated between the two nearest directions and apertures.
+    """Sums (K, S, D) over P waves, each interpolated between directions and apertures.
 
     While the array turns the beam is smeared: three directions with the variance of an even turn
     stand for it.
     """
-    directions = beams.shape[1]
-    for s in range(len(wave)):
-        if gain[s] == 0.0:
-            continue
-        e = 0
-        while e < len(apertures) - 2 and apertures[e + 1] > aperture[s]:
-            e += 1
-        low = (apertures[e] - aperture[s]) / (apertures[e] - apertures[e + 1])
-        low = min(max(low, 0.0), 1.0)
+    directions, size = beams.shape[1], beams.shape[2]
+    beam = np.empty(size, dtype=np.float32)
+    for s in range(wave.shape[1]):
         step = turn[s] / np.sqrt(8.0)
         looks = 3 if step > 0.2 else 1
-        for j in range(looks):
-            at = wave[s] + (j - 1) * step if looks == 3 else wave[s]
-            at -= np.floor(at / directions) * directions
-            left = int(at)
-            share = at - left
-            left %= directions
-            right = (left + 1) % directions
-            for b in range(len(starts) - 1):
-                size = gain[s] * weight[s, b] / looks
-                a0, a1 = (
-                    np.float32((1 - low) * (1 - share) * size),
-                    np.float32((1 - low) * share * size),
-                )
-                b0, b1 = np.float32(low * (1 - share) * size), np.float32(low * share * size)
-                for d in range(starts[b], starts[b + 1]):
-                    out[s, d] += (
-                        a0 * beams[e, left, d]
-                        + a1 * beams[e, right, d]
-                        + b0 * beams[e + 1, left, d]
-                        + b1 * beams[e + 1, right, d]
+        for p in range(len(wave)):
+            if not np.any(gain[:, p, s]):
+                continue
+            e = 0
+            while e < len(apertures) - 2 and apertures[e + 1] > aperture[p, s]:
+                e += 1
+            low = (apertures[e] - aperture[p, s]) / (apertures[e] - apertures[e + 1])
+            low = min(max(low, 0.0), 1.0)
+            beam[:] = 0.0
+            for j in range(looks):
+                at = wave[p, s] + (j - 1) * step if looks == 3 else wave[p, s]
+                at -= np.floor(at / directions) * directions
+                left = int(at)
+                share = at - left
+                left %= directions
+                right = (left + 1) % directions
+                for b in range(len(starts) - 1):
+                    one = weight[s, b] / looks
+                    a0, a1 = (
+                        np.float32((1 - low) * (1 - share) * one),
+                        np.float32((1 - low) * share * one),
                     )
+                    b0, b1 = np.float32(low * (1 - share) * one), np.float32(low * share * one)
+                    for d in range(starts[b], starts[b + 1]):
+                        beam[d] += (
+                            a0 * beams[e, left, d]
+                            + a1 * beams[e, right, d]
+                            + b0 * beams[e + 1, left, d]
+                            + b1 * beams[e + 1, right, d]
+                        )
+            for k in range(len(out)):
+                factor = np.float32(gain[k, p, s])
+                for d in range(size):
+                    out[k, s, d] += factor * beam[d]

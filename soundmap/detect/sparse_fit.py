@@ -26,8 +26,8 @@ from soundmap.detect.sound_paths import (
     Path,
     Paths,
     departures,
+    paths_heard,
     sound_paths,
-    waves_heard,
 )
 from soundmap.geometry import FloatArray
 
@@ -124,12 +124,6 @@ class SparseFit:
         """What a component adds to the scans, shape (S, D)."""
         strength = component.strength[self.evidence.table.part].astype(np.float32)
         return np.asarray(component.column * strength)
-
-    def heard(self, component: Component, path: int, scans: slice = slice(None)) -> Single:
-        """What some scans hear of a component of strength 1 along a path, shape (s, D)."""
-        paths = component.paths
-        wave, aperture = paths.wave[path, scans], paths.aperture[path, scans]
-        return waves_heard(self.evidence, wave, aperture, paths.gain[path, scans], scans)
 
     def energy(self, component: Component) -> float:
         """Of all that a component adds to the scans."""
@@ -243,11 +237,11 @@ class SparseFit:
         """Ways and column of a component that has new paths."""
         component.ways = self._ways(component)
         component.weighted = component.weighted_by = None
-        component.column = self.heard(component, Path.DIRECT)
-        for share, paths in component.ways.items():
-            for path in paths:
-                heard = self.heard(component, path)
-                component.column += np.float32(component.shares[share]) * heard
+        taken = component.taken()
+        share = np.array([share for _, share in taken])[None, :, None]
+        (component.column,) = paths_heard(
+            self.evidence, component.paths, [path for path, _ in taken], share
+        )
 
     def _ways(self, component: Component) -> dict[Share, list[int]]:
         """Paths that have a share, as far as any scan hears them."""

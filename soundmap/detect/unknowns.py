@@ -14,7 +14,6 @@ import numpy as np
 
 from soundmap.detect.component import ASSUMED, SHARE_SIGMA, Component, Share
 from soundmap.detect.harmonics import Single
-from soundmap.detect.model_errors import bearing_derivative
 from soundmap.detect.sound_paths import (
     NEAREST_M,
     Kind,
@@ -22,8 +21,10 @@ from soundmap.detect.sound_paths import (
     departures,
     heard_places,
     mirrors,
+    paths_heard,
 )
 from soundmap.detect.sparse_fit import SparseFit
+from soundmap.geometry import FloatArray
 
 PLACE, LOBE = (0, 1), (5, 6)
 """Axes of a component: its place along x and y, and its directivity along x and y. Those in between
@@ -89,46 +90,47 @@ def derivatives(fit: SparseFit, owners: Sequence[Owner], scans: slice) -> Iterat
     scans : slice
     """
     for _, group in groupby(owners, key=lambda owner: id(owner[0])):
-        own = list(group)
-        component, axes = own[0][0], [axis for _, axis in own]
+        of_one = list(group)
+        component, axes = of_one[0][0], [axis for _, axis in of_one]
         strength = component.strength[fit.evidence.table.part].astype(np.float32)
-        by_axis: dict[int, Single] = {}
+        changes: dict[int, Single] = {}
         if not set(axes).isdisjoint(PLACE):
-            by_axis |= zip(PLACE, _by_place(fit, component, scans), strict=True)
-        if not set(axes) <= set(PLACE):
-            heard = {path: fit.heard(component, path, scans) for path, _ in component.taken()}
-            for share, paths in component.ways.items():
-                by_axis[share] = np.sum([heard[path] for path in paths], axis=0)
-            if not set(axes).isdisjoint(LOBE):
-                by_axis |= zip(LOBE, _by_directivity(fit, component, heard, scans), strict=True)
+            changes |= zip(PLACE, _by_place(fit, component, scans), strict=True)
+        if not set(axes).isdisjoint(LOBE):
+            changes |= zip(LOBE, _by_directivity(fit, component, scans), strict=True)
         for axis in axes:
-            yield by_axis[axis] * strength
+            own = changes[axis] if axis in changes else _by_share(fit, component, axis, scans)
+            yield own * strength
 
 
-def _by_place(fit: SparseFit, component: Component, scans: slice) -> Sequence[Single]:
-    """Change with the place along x and y at strength 1, by the bearings of all paths."""
-    evidence = fit.evidence
-    total = [np.zeros_like(evidence.heard[scans]) for _ in PLACE]
-    seems = heard_places(fit.walls, component.place_m)
-    mirror = mirrors(fit.walls)
-    for path, share in component.taken():
-        step = seems[path] - evidence.place_m[scans]
-        square = np.maximum(np.sum(step**2, axis=1), NEAREST_M**2) / evidence.handedness
-        across = np.column_stack([-step[:, 1], step[:, 0]]) @ mirror[path]
-        bearing = (share * across / square[:, None]).astype(np.float32)
-        turned = bearing_derivative(evidence, component.paths, scans, path=path)
-        for axis in PLACE:
-            total[axis] += turned * bearing[:, axis, None]
-    return total
+def _by_share(fit: SparseFit, component: Component, axis: int, scans: slice) -> Single:
+    """Change with a share at strength 1, shape (s, D)."""
+    paths = component.ways[Share(axis)]
+    return paths_heard(fit.evidence, component.paths, paths, np.ones((1, 1, 1)), scans)[0]
 
 
-def _by_directivity(
-    fit: SparseFit, component: Component, heard: dict[int, Single], scans: slice
-) -> Sequence[Single]:
-    """Change with the directivity along x and y at strength 1."""
-    toward = departures(fit.walls, component.place_m, fit.evidence.place_m[scans])
-    weight = {path: (share * toward[path]).astype(np.float32) for path, share in component.taken()}
-    return [
-        np.sum([heard[path] * each[:, axis, None] for path, each in weight.items()], axis=0)
-        for axis in range(len(LOBE))
-    ]
+def _by_place(fit: SparseFit, component: Component, scans: slice) -> Single:
+    """Change with the place at strength 1 by the bearings of all paths, shape (2, s, D)."""
+    chosen, share = _taken(component)
+    stand = fit.evidence.place_m[scans]
+    step = heard_places(fit.walls, component.place_m)[chosen, None] - stand
+    square = np.maximum(np.sum(step**2, axis=2), NEAREST_M**2) / fit.evidence.handedness
+    across = np.stack([-step[..., 1], step[..., 0]], axis=-1) @ mirrors(fit.walls)[chosen]
+    bearing = share[:, None, None] * across / square[..., None]
+    return paths_heard(
+        fit.evidence, component.paths, chosen, np.moveaxis(bearing, 2, 0), scans, turned=True
+    )
+
+
+def _by_directivity(fit: SparseFit, component: Component, scans: slice) -> Single:
+    """Change with the directivity at strength 1, shape (2, s, D)."""
+    chosen, share = _taken(component)
+    toward = departures(fit.walls, component.place_m, fit.evidence.place_m[scans])[chosen]
+    weight = np.moveaxis(share[:, None, None] * toward, 2, 0)
+    return paths_heard(fit.evidence, component.paths, chosen, weight, scans)
+
+
+def _taken(component: Component) -> tuple[list[int], FloatArray]:
+    """Paths that a component takes, and the share of each, shape (P,)."""
+    taken = component.taken()
+    return [path for path, _ in taken], np.array([share for _, share in taken])
