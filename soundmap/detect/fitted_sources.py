@@ -53,6 +53,8 @@ VAGUE_M = 0.5
 """A source is somewhere: within so much of where it is reported [m], with 95 %."""
 STRETCH_M = 0.5
 """Bearings err much the same way for half a metre on end."""
+SETTLED_ALIKE = 0.6
+"""Once they are settled, so much of that: harmonics then err one by one, too."""
 ONE_SIDE_RAD = np.radians(40.0)
 LOUD_SIDE = 0.75
 """Share of all that is told of a source that makes it no louder than along its axis."""
@@ -186,7 +188,8 @@ def _told(fit: SparseFit, ground: _Ground) -> list[_Told]:
 
 def _placed_anew(fit: SparseFit, told: Sequence[_Told], ground: _Ground) -> list[_Told]:
     """Those that are still in the fit, where they are now."""
-    places = dict(zip(map(id, fit.components), _placements(fit, ground), strict=True))
+    placements = _placements(fit, ground, SETTLED_ALIKE)
+    places = dict(zip(map(id, fit.components), placements, strict=True))
     return [
         replace(each, placement=places[id(each.component)])
         for each in told
@@ -194,12 +197,12 @@ def _placed_anew(fit: SparseFit, told: Sequence[_Told], ground: _Ground) -> list
     ]
 
 
-def _placements(fit: SparseFit, ground: _Ground) -> list[Placement]:
-    """Where each component stands."""
+def _placements(fit: SparseFit, ground: _Ground, alike: float = 1.0) -> list[Placement]:
+    """Where each component stands, if such a share of what may err alike does."""
     return [
         placement(
             component.place_m.copy(),
-            covariance * _erring_alike(component, ground.square),
+            alike * _erring_alike(component, ground.square) * covariance,
             ground.surface_m,
             ground.odds,
         )

@@ -61,6 +61,15 @@ def test_sources_are_where_they_settle_if_that_is_near(monkeypatch, step, found)
         np.testing.assert_allclose(away, step, atol=0.05)
 
 
+def test_the_ellipse_of_a_settled_source_goes_with_what_errs_alike(monkeypatch):
+    reach = []
+    for share in (0.6, 60.0):
+        monkeypatch.setattr(module, "SETTLED_ALIKE", share)
+        (source,) = run([(3.5, 3.2, 20.0)])  # in the open
+        reach.append(np.sqrt(np.linalg.eigvalsh(source.fit.covariance_m2)[-1]))
+    assert reach[1] > 3.0 * reach[0]
+
+
 @pytest.mark.parametrize(("silent", "flagged"), [(0, False), (1, False), (4, True), (6, True)])
 def test_a_source_that_sounds_at_times_only_is_unsteady(silent, flagged):
     """Of each ten seconds, so many are silent."""
