@@ -61,6 +61,44 @@ def test_sources_are_where_they_settle_if_that_is_near(monkeypatch, step, found)
         np.testing.assert_allclose(away, step, atol=0.05)
 
 
+@pytest.mark.parametrize(
+    ("first", "settled", "probability"),
+    [
+        (0.01, 1e-6, 0.7e-4),
+        (0.01, 1.0, None),
+        (0.11, 1e-3, 0.7 * np.sqrt(0.11e-3)),  # may settle, though too likely a ghost at first
+        (0.13, 1e-9, None),
+    ],
+)
+def test_a_source_is_told_from_ghosts_twice(monkeypatch, first, settled, probability):
+    said = iter([first, settled])
+    monkeypatch.setattr(
+        module, "false_alarm_probabilities", lambda marks: np.full(len(marks.gain), next(said))
+    )
+    found = run([(3.5, 3.2, 20.0)])
+    told = [source.fit.false_alarm_probability for source in found]
+    assert told == pytest.approx([] if probability is None else [probability])
+
+
+def test_what_settling_shows_to_be_a_ghost_takes_no_part_in_the_end(monkeypatch):
+    settled = []
+
+    def settle(fit, components):
+        settled.append(len(components))
+        fit.components = list(components)
+        fit.refit()
+
+    def probabilities(marks):
+        return np.where(marks.gain < marks.gain.max(), 0.5 if settled else 0.01, 1e-4)
+
+    monkeypatch.setattr(module, "settle", settle)
+    monkeypatch.setattr(module, "false_alarm_probabilities", probabilities)
+    (source,) = run([(5.9, 3.1, 20.0), (0.1, 3.0, 5.0)])
+    assert settled[-1] == 1
+    assert len(settled) == 2
+    np.testing.assert_allclose((source.x_m, source.y_m), (5.9, 3.1), atol=0.1)
+
+
 def test_the_ellipse_of_a_settled_source_goes_with_what_errs_alike(monkeypatch):
     reach = []
     for share in (0.6, 60.0):
@@ -74,7 +112,7 @@ def test_the_ellipse_of_a_settled_source_goes_with_what_errs_alike(monkeypatch):
 def test_a_source_that_sounds_at_times_only_is_unsteady(silent, flagged):
     """Of each ten seconds, so many are silent."""
     place = (5.9, 3.1, 20.0)
-    scans, *rest = observed([place])
+    scans, *rest = observed([place], reflected=0.5)
     quiet, *_ = observed([(*place[:2], 1e-3)])
     pause = ((scans.time_ns - scans.time_ns[0]) * 1e-9 % 10.0 < silent)[:, None, None]
     parts = np.where(pause, quiet.sub_bands, scans.sub_bands)
