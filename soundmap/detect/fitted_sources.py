@@ -42,8 +42,6 @@ from soundmap.sound import AudioScans, Source, SourceFit, SourceList
 LEAST_SCANS = 8
 LEAST_EFFECTIVE_SCANS = 5.0
 """A source is heard by at least so many scans (effective number)."""
-LEAST_NOISE = 0.5
-"""What is explained counts in units of what is left, but of no less than this of the noise."""
 ONE_SOURCE_M = 0.45
 """Components placed nearer to each other than this are one source."""
 STAYS_M = 0.4
@@ -182,7 +180,7 @@ def _told(fit: SparseFit, ground: _Ground) -> list[_Told]:
     """All components with what speaks for them, those that explain most first."""
     components = fit.components
     places = _placements(fit, ground)
-    noise = max(fit.noise, LEAST_NOISE)
+    noise = fit.noise
     marks = Marks(
         gain=np.array([fit.gain(index) / noise for index in range(len(components))]),
         steadiness=steadiness(fit, ground.square),

@@ -21,8 +21,6 @@ from soundmap.geometry import FloatArray
 
 CHANGE = 40.0
 """Price of a change, in units of the noise: chance does not pay it."""
-LEAST_NOISE = 0.5
-"""That unit is what the fit leaves, but no less than this of what was expected."""
 LEAST_CHANGES, SHORTEST_S = 4, 0.6
 """A machine that pauses is heard to change so often, and to stay as it is for so long."""
 WORTH, LEAST_WORTH = 0.25, 200.0
@@ -87,7 +85,7 @@ def _told(fit: SparseFit, index: int) -> tuple[FloatArray, FloatArray]:
     """
     component = fit.components[index]
     own = fit.residual + fit.sound(component)
-    weighted = fit.weighted_columns()[index] / np.float32(max(fit.noise, LEAST_NOISE))
+    weighted = fit.weighted_columns()[index] / np.float32(fit.noise)
     starts = fit.evidence.table.starts[:-1]
     match = np.add.reduceat(weighted * own, starts, axis=1)
     energy = np.add.reduceat(weighted * component.column, starts, axis=1)

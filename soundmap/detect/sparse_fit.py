@@ -31,6 +31,8 @@ from soundmap.detect.sound_paths import (
 )
 from soundmap.geometry import FloatArray
 
+LEAST_NOISE = 0.5
+"""What is explained counts in units of no less than this of the noise that was expected."""
 BEHIND_M = 0.8
 """A wall no farther from a source than this may reflect a share of its own of that source's sound:
 cabinets radiate little to their backs."""
@@ -83,8 +85,11 @@ class SparseFit:
 
     @property
     def noise(self) -> float:
-        """Mean square of what is left, over what was expected."""
-        return self.misfit / self.evidence.heard.size
+        """Mean square of what is left, over what was expected; `LEAST_NOISE` at least.
+
+        What is explained counts in units of it.
+        """
+        return max(self.misfit / self.evidence.heard.size, LEAST_NOISE)
 
     @property
     def strengths(self) -> FloatArray:
