@@ -2,7 +2,8 @@ r"""From all audio scans of a run to its sources and their mirror images, by a s
 
 What a loud source leaves unexplained may look like a weak one. A component of the fit counts as a
 source if such ghosts hardly ever look as much like one: `soundmap.detect.significance`. Sources and
-their mirror images then find their places without the ghosts.
+their mirror images then find their places without the ghosts, sources may be louder on one side,
+and are told from ghosts once more.
 
 It assumes sources that stand still and sound much of the time, and surfaces that the lasers see.
 It fails where a source moves, where two stand within half a metre of each other, and where a weak
@@ -156,7 +157,7 @@ def _found(
         if each.component.kind == Kind.IMAGE and each.probability <= rate
     ]
     apart = [each for each in _strongest_apart(told) if each.probability <= ADMITTED * rate]
-    if not apart:
+    if not apart and not images:
         return [], []
     stood = {id(each.component): each.component.place_m.copy() for each in apart}
     settle(fit, [*(each.component for each in apart), *images])
