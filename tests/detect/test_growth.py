@@ -5,6 +5,7 @@ from soundmap.config import ScanConfig
 from soundmap.detect import growth
 from soundmap.detect.evidence import gathered_evidence
 from soundmap.detect.matched_filter import HEIGHTS_M, explained, matched_scans
+from soundmap.detect.model_errors import FREE_ERRORS
 from soundmap.detect.sound_paths import Kind
 from soundmap.detect.sparse_fit import SparseFit
 from soundmap.detect.steps import move
@@ -36,6 +37,7 @@ def test_a_settled_source_does_not_hang_on_a_ghost_beside_it():
     fit.refit()
     growth.settle(fit, [source])
     assert fit.components == [source]
+    assert fit.errors == FREE_ERRORS
     np.testing.assert_allclose(source.place_m, (5.5, 3.1), atol=0.02)
     assert source.height_m == growth.SETTLED_HEIGHTS_M[0]
 
