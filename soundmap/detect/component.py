@@ -77,7 +77,10 @@ class Component:
     weighted_by: Precision | None = None
     coupling: FloatArray | None = None
 
-    def taken(self) -> list[tuple[int, float]]:
-        """All paths that it takes, and the part of its power that each has."""
-        others = [(way, self.shares[share]) for share, ways in self.ways.items() for way in ways]
-        return [(int(Path.DIRECT), 1.0), *others]
+    def taken(self) -> tuple[list[int], FloatArray]:
+        """All paths that it takes, and the part of its power that each has, shape (P,)."""
+        paths, parts = [int(Path.DIRECT)], [1.0]
+        for share, ways in self.ways.items():
+            paths += ways
+            parts += [self.shares[share]] * len(ways)
+        return paths, np.array(parts)

@@ -33,7 +33,7 @@ def by_offsets(fit: SparseFit, velocity: FloatArray) -> Single:
             continue
         strength = (component.strength[part] * evidence.handedness).astype(np.float32)
         places = heard_places(fit.walls, component.place_m)
-        for path, share in component.taken():
+        for path, share in zip(*component.taken(), strict=True):
             turned = bearing_derivative(evidence, component.paths, path=path)
             turned *= np.float32(share) * strength
             if path == Path.DIRECT:

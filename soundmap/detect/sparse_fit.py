@@ -242,10 +242,9 @@ class SparseFit:
         """Ways and column of a component that has new paths."""
         component.ways = self._ways(component)
         component.weighted = component.weighted_by = None
-        taken = component.taken()
-        share = np.array([share for _, share in taken])[None, :, None]
+        chosen, share = component.taken()
         (component.column,) = paths_heard(
-            self.evidence, component.paths, [path for path, _ in taken], share
+            self.evidence, component.paths, chosen, share[None, :, None]
         )
 
     def _ways(self, component: Component) -> dict[Share, list[int]]:

@@ -24,7 +24,6 @@ from soundmap.detect.sound_paths import (
     paths_heard,
 )
 from soundmap.detect.sparse_fit import SparseFit
-from soundmap.geometry import FloatArray
 
 PLACE, LOBE = (0, 1), (5, 6)
 """Axes of a component: its place along x and y, and its directivity along x and y. Those in between
@@ -111,7 +110,7 @@ def _by_share(fit: SparseFit, component: Component, axis: int, scans: slice) -> 
 
 def _by_place(fit: SparseFit, component: Component, scans: slice) -> Single:
     """Change with the place at strength 1 by the bearings of all paths, shape (2, s, D)."""
-    chosen, share = _taken(component)
+    chosen, share = component.taken()
     stand = fit.evidence.place_m[scans]
     step = heard_places(fit.walls, component.place_m)[chosen, None] - stand
     square = np.maximum(np.sum(step**2, axis=2), NEAREST_M**2) / fit.evidence.handedness
@@ -124,13 +123,7 @@ def _by_place(fit: SparseFit, component: Component, scans: slice) -> Single:
 
 def _by_directivity(fit: SparseFit, component: Component, scans: slice) -> Single:
     """Change with the directivity at strength 1, shape (2, s, D)."""
-    chosen, share = _taken(component)
+    chosen, share = component.taken()
     toward = departures(fit.walls, component.place_m, fit.evidence.place_m[scans])[chosen]
     weight = np.moveaxis(share[:, None, None] * toward, 2, 0)
     return paths_heard(fit.evidence, component.paths, chosen, weight, scans)
-
-
-def _taken(component: Component) -> tuple[list[int], FloatArray]:
-    """Paths that a component takes, and the share of each, shape (P,)."""
-    taken = component.taken()
-    return [path for path, _ in taken], np.array([share for _, share in taken])

@@ -1,5 +1,7 @@
 """Scans made by a sum over sources and images in a rectangular room, with exact laser ranges."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from soundmap.config import ScanConfig
@@ -121,6 +123,16 @@ def _heard_at(place, x, y, strength, lobe=(0.0, 0.0), *, reflected):
     for at_x, at_y, flip_x, flip_y, share in seems:
         leaves = (place - (at_x, at_y)) * (flip_x, flip_y)
         yield at_x, at_y, share * strength * np.exp(leaves @ lobe / np.hypot(*leaves))
+
+
+def still_evidence():
+    """What a source before the wall x = WIDTH sounds like to an array that does not turn."""
+    gathered = gathered_evidence(*observed([(6.0, 3.0, 50.0)]), ScanConfig())
+    return replace(gathered, turn_rad=0.0 * gathered.turn_rad)
+
+
+def relative_error(change, expected):
+    return np.linalg.norm(change - expected) / np.linalg.norm(expected)
 
 
 def begun_fit(emitters, **more):

@@ -108,11 +108,22 @@ def test_the_ellipse_of_a_settled_source_goes_with_what_errs_alike(monkeypatch):
     assert reach[1] > 3.0 * reach[0]
 
 
-@pytest.mark.parametrize(("silent", "flagged"), [(0, False), (1, False), (4, True), (6, True)])
-def test_a_source_that_sounds_at_times_only_is_unsteady(silent, flagged):
+@pytest.mark.parametrize(
+    ("silent", "reflected", "flagged"),
+    [
+        (0, 0.0, False),
+        (1, 0.0, False),
+        (4, 0.0, True),
+        (0, 0.5, False),
+        (1, 0.5, False),
+        (4, 0.5, True),
+        (6, 0.5, True),
+    ],
+)
+def test_a_source_that_sounds_at_times_only_is_unsteady(silent, reflected, flagged):
     """Of each ten seconds, so many are silent."""
     place = (5.9, 3.1, 20.0)
-    scans, *rest = observed([place], reflected=0.5)
+    scans, *rest = observed([place], reflected=reflected)
     quiet, *_ = observed([(*place[:2], 1e-3)])
     pause = ((scans.time_ns - scans.time_ns[0]) * 1e-9 % 10.0 < silent)[:, None, None]
     parts = np.where(pause, quiet.sub_bands, scans.sub_bands)

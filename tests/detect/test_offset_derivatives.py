@@ -7,13 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from soundmap.config import ScanConfig
 from soundmap.detect.component import Share
-from soundmap.detect.evidence import gathered_evidence
 from soundmap.detect.offset_derivatives import by_offsets
 from soundmap.detect.sound_paths import Kind, Path, sound_paths, waves_heard
 from soundmap.detect.sparse_fit import SparseFit
-from tests.detect.box_room import DEPTH, observed
+from tests.detect.box_room import DEPTH, relative_error, still_evidence
 
 WALLS = np.array([[0.0, 1.0, 0.0], [0.0, 1.0, DEPTH]])
 PLACE, HEIGHT_M, STRENGTH = np.array([5.5, 3.0]), 0.1, 20.0
@@ -22,9 +20,7 @@ STEP = np.radians(1.0)  # as far apart as the beams that are told apart
 
 @pytest.fixture
 def evidence():
-    heard, around, way, array = observed(((6.0, 3.0, 50.0),))
-    gathered = gathered_evidence(heard, around, way, array, ScanConfig())
-    return replace(gathered, turn_rad=0.0 * gathered.turn_rad)
+    return still_evidence()
 
 
 def sounding(evidence, walls=WALLS):
@@ -32,10 +28,6 @@ def sounding(evidence, walls=WALLS):
     source = fit.add(PLACE, HEIGHT_M, Kind.SOURCE)
     source.strength = np.full(evidence.sub_bands, STRENGTH)
     return fit, source
-
-
-def relative_error(change, expected):
-    return np.linalg.norm(change - expected) / np.linalg.norm(expected)
 
 
 @pytest.mark.parametrize("hand", [1, -1])
@@ -57,7 +49,7 @@ def test_scans_change_with_clock_and_yaw_as_the_array_moves(evidence, hand):
         )
         moved = sound_paths(after, WALLS, PLACE, HEIGHT_M, Kind.SOURCE)
         total = SparseFit(after, WALLS).far_field.heard(fit.far_harmonics)
-        for path, share in source.taken():
+        for path, share in zip(*source.taken(), strict=True):
             if path == Path.DIRECT or not directly:
                 there = moved.wave[path] if path < Path.WALLS else mirrored(after, path)
                 own = waves_heard(after, there, paths.aperture[path], paths.gain[path])

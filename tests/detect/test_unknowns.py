@@ -7,13 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from soundmap.config import ScanConfig
 from soundmap.detect.component import ASSUMED, Share
-from soundmap.detect.evidence import gathered_evidence
 from soundmap.detect.sound_paths import Kind, Path, heard_places, mirrors, waves_heard
 from soundmap.detect.sparse_fit import SparseFit
 from soundmap.detect.unknowns import LOBE, PLACE, change, derivatives, held, unknowns
-from tests.detect.box_room import DEPTH, WIDTH, observed
+from tests.detect.box_room import DEPTH, WIDTH, relative_error, still_evidence
 
 WALLS = np.array([[0.0, 1.0, 0.0], [0.0, 1.0, DEPTH], [1.0, 0.0, WIDTH]])
 HERE, HEIGHT_M, STRENGTH = np.array([5.5, 3.0]), 0.1, 20.0
@@ -23,9 +21,7 @@ EVERY = slice(None)
 
 @pytest.fixture
 def evidence():
-    heard, around, way, array = observed(((6.0, 3.0, 50.0),))
-    gathered = gathered_evidence(heard, around, way, array, ScanConfig())
-    return replace(gathered, turn_rad=0.0 * gathered.turn_rad)
+    return still_evidence()
 
 
 def sounding(evidence, kind=Kind.SOURCE, place=HERE):
@@ -33,10 +29,6 @@ def sounding(evidence, kind=Kind.SOURCE, place=HERE):
     source = fit.add(place, HEIGHT_M, kind)
     source.strength = np.full(evidence.sub_bands, STRENGTH)
     return fit, source
-
-
-def relative_error(change, expected):
-    return np.linalg.norm(change - expected) / np.linalg.norm(expected)
 
 
 @pytest.mark.parametrize("hand", [1, -1])
@@ -49,7 +41,7 @@ def test_scans_change_with_the_place_by_the_bearings_of_all_paths(evidence, hand
     def heard_from(place):
         """As loud as from here, along those paths that there are from here."""
         total = 0.0
-        for path, share in source.taken():
+        for path, share in zip(*source.taken(), strict=True):
             step = heard_places(WALLS, place)[path] - evidence.place_m
             turn = hand * (np.arctan2(step[:, 1], step[:, 0]) - evidence.axis_rad) / (2.0 * np.pi)
             wave = (turn - np.floor(turn)) * evidence.table.waves
