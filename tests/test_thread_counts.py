@@ -46,3 +46,12 @@ def test_results_come_in_the_order_of_the_items():
 def test_a_failure_in_one_item_is_raised():
     with pytest.raises(ZeroDivisionError):
         side_by_side(lambda item: 1 // item, [2, 1, 0])
+
+
+def test_work_may_share_out_work_of_its_own():
+    """Even if all threads do at the same time."""
+
+    def sums(count):
+        return sum(side_by_side(lambda item: item + count, range(count)))
+
+    assert side_by_side(sums, [10] * 20) == [145] * 20

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soundmap.detect.harmonics import Single
-from soundmap.detect.model_errors import Precision
 from soundmap.detect.sound_paths import Kind, Path, Paths
 from soundmap.geometry import FloatArray
 
@@ -57,10 +56,6 @@ class Component:
         In which scans it does: it may pause. The gains of its paths have that in them.
     ways : dict
         For each `Share` those paths that have it and that any scan hears.
-    weighted : ndarray of float32, shape (S, D), optional
-        Its column times the precision that is `weighted_by`; kept since refits are many.
-    coupling : ndarray, shape (D,), optional
-        Products of that with the columns of the far field.
     """
 
     place_m: FloatArray
@@ -73,9 +68,6 @@ class Component:
     directivity: FloatArray = field(default_factory=EVEN.copy)
     sounding: NDArray[np.bool_] | None = None
     ways: dict[Share, list[int]] = field(default_factory=dict)
-    weighted: Single | None = None
-    weighted_by: Precision | None = None
-    coupling: FloatArray | None = None
 
     def taken(self) -> tuple[list[int], FloatArray]:
         """All paths that it takes, and the part of its power that each has, shape (P,)."""

@@ -22,6 +22,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
+from numba import njit
 
 from soundmap.detect.evidence import Evidence
 from soundmap.detect.harmonics import Single
@@ -62,6 +63,10 @@ class FarField:
         return np.concatenate(
             [turning.pull(weighted[..., slice(*own)], scans) for turning, own in bands], axis=-1
         ).astype(np.float64)
+
+    def pull_band(self, band: int, weighted: Single, scans: slice) -> Single:
+        """The same of one sub-band, columns (..., s, d) to (..., d)."""
+        return self._bands[band].pull(weighted, scans)
 
     def pulls(self, weighted: Single) -> Single:
         r""":math:`A_s^T` times a column (S, D), scan by scan, shape (S, D)."""
@@ -111,6 +116,7 @@ class FarFieldBand:
         size = np.sqrt(0.5 * np.sum(by_cos**2 + by_sin**2, axis=0)) + 1e-12
         self._by_cos = (by_cos / size).astype(np.float32)
         self._by_sin = (by_sin / size * evidence.handedness).astype(np.float32)
+        self._by_both = np.hstack([self._by_cos, self._by_sin])
         smeared = (1.0 + 2.0 * np.cos(evidence.turn_rad[:, None] * number / np.sqrt(8.0))) / 3.0
         smeared *= evidence.weight[:, band : band + 1]
         turn = evidence.axis_rad[:, None] * number
@@ -141,15 +147,10 @@ class FarFieldBand:
 
     def pull(self, weighted: Single, scans: slice) -> Single:
         """Sum of the columns' products with others (..., s, d), shape (..., d)."""
-        cos, sin = self._cos[scans], self._sin[scans]
-        even, odd = weighted @ self._by_cos, weighted @ self._by_sin
-        return np.concatenate(
-            [
-                np.einsum("sh,...sh->...h", cos, even) - np.einsum("sh,...sh->...h", sin, odd),
-                np.einsum("sh,...sh->...h", sin, even) + np.einsum("sh,...sh->...h", cos, odd),
-            ],
-            axis=-1,
-        )
+        both = np.ascontiguousarray(weighted) @ self._by_both
+        told = np.zeros((both[..., 0, :].size // both.shape[-1], both.shape[-1]), np.float32)
+        _add_turned(told, both.reshape(-1, *both.shape[-2:]), self._cos[scans], self._sin[scans])
+        return told.reshape(*both.shape[:-2], -1)
 
     def pulls(self, weighted: Single) -> Single:
         """The columns' products with another (S, d), scan by scan, shape (S, d)."""
@@ -161,3 +162,15 @@ class FarFieldBand:
         cos, sin = np.split(field, 2)
         even, odd = self._cos * cos + self._sin * sin, self._cos * sin - self._sin * cos
         return even @ self._by_cos.T + odd @ self._by_sin.T
+
+
+@njit(cache=True, nogil=True)
+def _add_turned(out: Single, both: Single, cos: Single, sin: Single) -> None:
+    """Sums (K, d) of products (K, s, d) with both parts of each harmonic, turned scan by scan."""
+    half = cos.shape[1]
+    for k in range(len(both)):
+        for s in range(len(cos)):
+            for h in range(half):
+                even, odd = both[k, s, h], both[k, s, half + h]
+                out[k, h] += cos[s, h] * even - sin[s, h] * odd
+                out[k, half + h] += sin[s, h] * even + cos[s, h] * odd

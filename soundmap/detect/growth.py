@@ -115,8 +115,8 @@ def rough_fit(
             fit.add(candidate.place_m, float(HEIGHTS_M[int(np.argmax(value))]), candidate.kind)
         fit.refit()
         fit.renew()
-        move(fit)
-        move(fit)
+        move(fit, only_places=True)
+        move(fit, only_places=True)
         if len(fit.components) >= MOST_COMPONENTS:
             break
     return fit

@@ -15,6 +15,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from soundmap.beam import beam_patterns
@@ -140,3 +141,58 @@ def _half_width(patterns: FloatArray) -> float:
     """Mean over the waves of half the main lobe's width at half its height [rad]."""
     above = np.sum(patterns > 0.5, axis=1)
     return float(np.pi * np.mean(above) / patterns.shape[1])
+
+
+@njit(cache=True, nogil=True)
+def look_up(
+    beam: Single, beams: Single, weight: Single, wave: float, aperture: float, turn: float
+) -> None:
+    """Put a beam (D,), times a weight (D,), interpolated between directions and apertures.
+
+    While the array turns the beam is smeared: three directions with the variance of an even turn
+    stand for it.
+
+    Parameters
+    ----------
+    beam : ndarray of float32, shape (D,)
+        Where it is put.
+    beams : ndarray of float32, shape (E, M, D)
+        `BeamTable.beams`, or how they change with the direction.
+    weight : ndarray of float32, shape (D,)
+    wave, turn : float
+        Direction, and how far the array turned, in steps of the beams' directions.
+    aperture : float
+    """
+    directions = beams.shape[1]
+    step = turn / np.sqrt(8.0)
+    looks = 3 if step > 0.2 else 1
+    e = 0
+    while e < len(APERTURES) - 2 and APERTURES[e + 1] > aperture:
+        e += 1
+    low = (APERTURES[e] - aperture) / (APERTURES[e] - APERTURES[e + 1])
+    low = min(max(low, 0.0), 1.0)
+    beam[:] = 0.0
+    for j in range(looks):
+        at = wave + (j - 1) * step if looks == 3 else wave
+        at -= np.floor(at / directions) * directions
+        left = int(at)
+        share = at - left
+        left %= directions
+        right = (left + 1) % directions
+        a0, a1 = np.float32((1 - low) * (1 - share) / looks), np.float32((1 - low) * share / looks)
+        b0, b1 = np.float32(low * (1 - share) / looks), np.float32(low * share / looks)
+        for d in range(len(beam)):
+            beam[d] += weight[d] * (
+                a0 * beams[e, left, d]
+                + a1 * beams[e, right, d]
+                + b0 * beams[e + 1, left, d]
+                + b1 * beams[e + 1, right, d]
+            )
+
+
+@njit(cache=True, nogil=True)
+def add(out: Single, factor: float, beam: Single) -> None:
+    """Add a multiple of a beam to what is heard, both (D,)."""
+    single = np.float32(factor)
+    for d in range(len(beam)):
+        out[d] += single * beam[d]

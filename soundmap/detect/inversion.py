@@ -1,8 +1,4 @@
-"""Inverses of many small covariance matrices at once.
-
-numpy calls its solver for general matrices, through buffers of its own, once for each: of matrices
-with some dozen rows that takes several times as long as the sums themselves.
-"""
+"""Inverses of many small covariance matrices at once: few modes, and noise that is independent."""
 
 from __future__ import annotations
 
@@ -13,30 +9,50 @@ from soundmap.detect.harmonics import Single
 
 
 @njit(cache=True, nogil=True)
-def invert(covariance: Single) -> None:
-    r"""Put the inverse of each symmetric positive definite matrix in its place, shape (S, d, d).
+def inverse_covariances(modes: Single, variance: Single, out: Single) -> None:
+    r"""Inverses of :math:`N_s + \sum_m u_{ms} u_{ms}^T` with diagonal N.
 
-    Every pivot is swept in turn, on the lower triangle and in double precision (Goodnight, "A
-    tutorial on the SWEEP operator", The American Statistician 33, 1979).
+    By the identity of Woodbury, in double precision: with the modes scaled to unit noise,
+    :math:`(I + U U^T)^{-1} = I - V^T V`, where :math:`V = L^{-1} U^T` and
+    :math:`L L^T = I + U^T U`, which has only as many rows as there are modes.
+
+    Parameters
+    ----------
+    modes : ndarray of float32, shape (M, S, d)
+    variance : ndarray of float32, shape (S, d)
+        The diagonals of N, positive.
+    out : ndarray of float32, shape (S, d, d)
     """
-    size = covariance.shape[1]
-    swept, pivot_row = np.empty((size, size)), np.empty(size)
-    for s in range(len(covariance)):
+    count, scans, size = modes.shape
+    row, gram = np.empty((count, size)), np.empty((count, count))
+    single, other = np.empty((count, size), np.float32), np.empty((size, count), np.float32)
+    scale = np.empty(size)
+    for s in range(scans):
         for i in range(size):
-            for j in range(i + 1):
-                swept[i, j] = covariance[s, i, j]
-        for k in range(size):
-            for j in range(size):
-                pivot_row[j] = swept[k, j] if j <= k else swept[j, k]
+            scale[i] = 1.0 / np.sqrt(variance[s, i])
+        for m in range(count):
             for i in range(size):
-                share = pivot_row[i] / pivot_row[k]
-                for j in range(i + 1):
-                    swept[i, j] -= share * pivot_row[j]
-            for j in range(k):
-                swept[k, j] = pivot_row[j] / pivot_row[k]
-            for i in range(k + 1, size):
-                swept[i, k] = pivot_row[i] / pivot_row[k]
-            swept[k, k] = -1.0 / pivot_row[k]
+                row[m, i] = modes[m, s, i] * scale[i]
+        np.dot(row, row.T, gram)
+        for m in range(count):
+            for k in range(m):
+                rest = gram[m, k]
+                for j in range(k):
+                    rest -= gram[m, j] * gram[k, j]
+                rest /= gram[k, k]
+                gram[m, k] = rest
+                for i in range(size):
+                    row[m, i] -= rest * row[k, i]
+            rest = 1.0 + gram[m, m]
+            for j in range(m):
+                rest -= gram[m, j] ** 2
+            gram[m, m] = np.sqrt(rest)
+            for i in range(size):
+                row[m, i] /= gram[m, m]
+        for m in range(count):
+            for i in range(size):
+                single[m, i] = row[m, i] * scale[i]
+                other[i, m] = -single[m, i]
+        np.dot(other, single, out[s])
         for i in range(size):
-            for j in range(i + 1):
-                covariance[s, i, j] = covariance[s, j, i] = -swept[i, j]
+            out[s, i, i] += scale[i] * scale[i]

@@ -18,17 +18,19 @@ adds to the scan.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import chain, pairwise
+from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
+from numba import njit
+from numpy.typing import NDArray
 
 from soundmap.detect.evidence import Evidence
-from soundmap.detect.harmonics import Single
-from soundmap.detect.inversion import invert
-from soundmap.detect.sound_paths import Path, Paths, paths_heard, waves_heard
+from soundmap.detect.harmonics import Single, add, look_up
+from soundmap.detect.inversion import inverse_covariances
+from soundmap.detect.sound_paths import Path, Paths
 from soundmap.geometry import FloatArray
 from soundmap.side_by_side import side_by_side
 
@@ -40,9 +42,9 @@ HIDDEN_ERROR = 0.35
 """Of the share that passes a surface in the way."""
 FAR_FIELD_ERROR = 0.35
 """Of what the far field adds to one scan, over what it adds on average."""
-LEAST_MODE = 0.05
+LEAST_MODE = 0.01
 """A mode whose energy stays below this in all scans changes nothing."""
-SCANS_AT_ONCE = 128
+SCANS_AT_ONCE = 64
 
 
 @dataclass(frozen=True)
@@ -119,17 +121,15 @@ class Precision:
         bands = [slice(start, stop) for start, stop in pairwise(starts)]
 
         def invert(scans: slice) -> None:
-            loud: list[list[Single]] = [[] for _ in self.inverse]  # what is quiet goes at once
-            modes = [_modes(evidence, each, scans, errors) for each in components]
-            if far_field is not None:
-                modes.append(iter([np.float32(FAR_FIELD_ERROR) * far_field[scans]]))
-            for mode in chain.from_iterable(modes):
-                for kept, own in zip(loud, bands, strict=True):
-                    if _is_loud(mode[:, own]):
-                        kept.append(mode[:, own].copy())
-            alone = _alone(evidence, components, scans, errors.harmonic)
-            for kept, inverse, own in zip(loud, self.inverse, bands, strict=True):
-                inverse[scans] = _inverse(kept, inverse.shape[1], alone[:, own])
+            modes, energy, variance = _modes(evidence, components, scans, errors)
+            far = None if far_field is None else np.float32(FAR_FIELD_ERROR) * far_field[scans]
+            for band, (inverse, own) in enumerate(zip(self.inverse, bands, strict=True)):
+                loud = modes[energy[:, band] > LEAST_MODE, :, own]
+                if far is not None:
+                    loud = np.concatenate([loud, far[None, :, own]])
+                real, imaginary = np.split(variance[:, own], 2, axis=1)  # both err as much
+                even = np.tile(np.float32(0.5) * (real + imaginary), 2)
+                inverse_covariances(loud, even, inverse[scans])
 
         side_by_side(invert, parts(len(evidence)))
 
@@ -150,93 +150,100 @@ class Precision:
 
 
 def parts(scans: int) -> list[slice]:
-    """Scans that are worked on at once."""
-    return [slice(i, min(i + SCANS_AT_ONCE, scans)) for i in range(0, scans, SCANS_AT_ONCE)]
-
-
-def _is_loud(mode: Single) -> bool:
-    return bool(np.einsum("sd,sd->s", mode, mode).max() > LEAST_MODE)
-
-
-def _alone(
-    evidence: Evidence, components: Sequence[Sounding], scans: slice, share: float
-) -> Single:
-    """Variance of errors of single harmonics, shape (s, D), or (1, D) where there are none.
-
-    Real and imaginary part of a harmonic have the same.
-    """
-    part = evidence.table.part
-    variance = np.zeros((len(evidence.place_m[scans]) if share else 1, len(part)), dtype=np.float32)
-    if not share:
-        return variance
-    for component in components:
-        paths, strength = component.paths, share * component.strength[part].astype(np.float32)
-        for path in (Path.DIRECT, *range(Path.WALLS, len(paths.gain))):
-            gain = paths.gain[path, scans]
-            if gain.any():
-                wave, aperture = paths.wave[path, scans], paths.aperture[path, scans]
-                heard = waves_heard(evidence, wave, aperture, gain, scans) * strength
-                reflected = 1.0 if path == Path.DIRECT else REFLECTED
-                variance += (np.float32(reflected) * heard) ** 2
-    for start, stop in pairwise(evidence.table.starts):
-        real, imaginary = np.split(variance[:, start:stop], 2, axis=1)
-        mean = 0.5 * (real + imaginary)
-        variance[:, start:stop] = np.hstack([mean, mean])
-    return variance
-
-
-def _inverse(modes: list[Single], size: int, alone: Single) -> Single:
-    """Inverse of the identity plus the squares of all modes, each (S, d); it takes them away.
-
-    Harmonics that err alone add their variance (S, d), or (1, d) if it is nought everywhere.
-    """
-    if not modes and len(alone) == 1:
-        return np.eye(size, dtype=np.float32)[None]
-    if modes:
-        stacked = np.stack(modes, axis=1)
-        modes.clear()
-        covariance = np.matmul(stacked.transpose(0, 2, 1), stacked)
-        del stacked
-    else:
-        covariance = np.zeros((len(alone), size, size), dtype=np.float32)
-    covariance[:, np.arange(size), np.arange(size)] += 1.0 + alone
-    invert(covariance)
-    return covariance
+    """Scans that are worked on at once: even parts of them, an even number of these."""
+    count = 2 * -(-scans // (2 * SCANS_AT_ONCE))
+    edges = [scans * i // count for i in range(count + 1)]
+    return [slice(*edge) for edge in pairwise(edges)]
 
 
 def _modes(
-    evidence: Evidence, component: Sounding, scans: slice, errors: ComponentErrors
-) -> Iterator[Single]:
-    """Modes of one component in some scans, each (S, D)."""
-    if not component.strength.any():
-        return
-    part = evidence.table.part
-    strength = component.strength[part].astype(np.float32)
-    bearing = (errors.bearing * evidence.table.width_rad)[part].astype(np.float32)
-    paths = component.paths
-    wave, gain = paths.wave[:, scans], paths.gain[:, scans]
-    aperture = paths.aperture[:, scans]
+    evidence: Evidence, components: Sequence[Sounding], scans: slice, errors: ComponentErrors
+) -> tuple[Single, Single, Single]:
+    """Modes (M, s, D) of components in some scans, and the greatest energy of each, (M, B).
 
-    def heard(path: int, turned: float = 0.0, lowered: float = 0.0) -> Single:
-        return waves_heard(
-            evidence, wave[path] + turned, aperture[path] - lowered, gain[path], scans
-        )
+    Last the variance (s, D) of noise and of harmonics that err one by one.
+    """
+    table, stand = evidence.table, evidence.heard[scans]
+    paths = [component.paths for component in components]
+    count = len(paths) * (len(paths[0].gain) + 2)
+    modes = np.zeros((count, *stand.shape), dtype=np.float32)
+    energy = np.zeros((count, evidence.sub_bands), dtype=np.float32)
+    variance = np.ones(stand.shape, dtype=np.float32)
+    size = np.full(len(paths[0].gain), errors.reflection)
+    size[Path.DIRECT], size[Path.HIDDEN] = errors.strength, HIDDEN_ERROR
+    alone = np.full(len(size), errors.harmonic * REFLECTED)
+    alone[[Path.DIRECT, Path.FLOOR, Path.HIDDEN]] = errors.harmonic, 0.0, 0.0
+    _add_modes(
+        modes,
+        energy,
+        variance,
+        size,
+        alone,
+        errors.bearing * table.width_rad,
+        np.array([component.strength for component in components]),
+        np.stack([each.wave[:, scans] for each in paths]),
+        np.stack([each.aperture[:, scans] for each in paths]),
+        np.stack([each.gain[:, scans] for each in paths]),
+        table.beams,
+        table.turned,
+        table.starts,
+        evidence.turn[scans],
+        evidence.weight[scans],
+    )
+    return modes, energy, variance
 
-    if gain[Path.DIRECT].any():
-        here = heard(Path.DIRECT)
-        yield here * (np.float32(errors.strength) * strength)
-        yield bearing_derivative(evidence, paths, scans) * (bearing * strength)
-        lowered = heard(Path.DIRECT, lowered=APERTURE_ERROR)
-        yield (here - lowered) * strength
-    for path in (Path.FLOOR, *range(Path.WALLS, len(gain))):
-        if gain[path].any():
-            yield heard(path) * (np.float32(errors.reflection) * strength)
-    if gain[Path.HIDDEN].any():
-        yield heard(Path.HIDDEN) * (np.float32(HIDDEN_ERROR) * strength)
 
+@njit(cache=True, nogil=True)
+def _add_modes(
+    modes: Single,
+    energy: Single,
+    variance: Single,
+    size: FloatArray,
+    alone: FloatArray,
+    bearing: FloatArray,
+    strength: FloatArray,
+    wave: FloatArray,
+    aperture: FloatArray,
+    gain: FloatArray,
+    beams: Single,
+    turned: Single,
+    starts: NDArray[np.int64],
+    turn: FloatArray,
+    weight: FloatArray,
+) -> None:
+    """Modes of C components: one for each path, then those of bearing and elevation.
 
-def bearing_derivative(
-    evidence: Evidence, paths: Paths, scans: slice = slice(None), *, path: int = Path.DIRECT
-) -> Single:
-    """Change of what is heard along a path with the bearing, shape (S, D) [1/rad]."""
-    return paths_heard(evidence, paths, [path], np.ones((1, 1, 1)), scans, turned=True)[0]
+    ``size`` and ``alone`` are errors of what each path brings, as a whole and harmonic by harmonic,
+    ``bearing`` those of the bearing [rad].
+    """
+    beam, noise = np.empty(modes.shape[2], np.float32), np.empty(modes.shape[2], np.float32)
+    paths = len(size)
+    for c in range(len(strength)):
+        first = c * (paths + 2)
+        for s in range(len(turn)):
+            for b in range(len(starts) - 1):
+                noise[starts[b] : starts[b + 1]] = weight[s, b] * strength[c, b]
+            for p in range(paths):
+                loud, at, cos = gain[c, p, s], wave[c, p, s], aperture[c, p, s]
+                if loud == 0.0:
+                    continue
+                look_up(beam, beams, noise, at, cos, turn[s])
+                add(modes[first + p, s], loud * size[p], beam)
+                if alone[p] > 0.0:
+                    share = np.float32((loud * alone[p]) ** 2)
+                    for d in range(len(beam)):
+                        variance[s, d] += share * beam[d] ** 2
+                if p == Path.DIRECT:
+                    lowered = modes[first + paths + 1, s]
+                    add(lowered, loud, beam)
+                    look_up(beam, beams, noise, at, cos - APERTURE_ERROR, turn[s])
+                    add(lowered, -loud, beam)
+                    look_up(beam, turned, noise, at, cos, turn[s])
+                    for b in range(len(starts) - 1):
+                        start, stop = starts[b], starts[b + 1]
+                        bent = modes[first + paths, s, start:stop]
+                        add(bent, loud * bearing[b], beam[start:stop])
+            for m in range(first, first + paths + 2):
+                for b in range(len(starts) - 1):
+                    own = modes[m, s, starts[b] : starts[b + 1]]
+                    energy[m, b] = max(energy[m, b], np.dot(own, own))

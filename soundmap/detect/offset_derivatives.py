@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from soundmap.detect.harmonics import Single
-from soundmap.detect.model_errors import bearing_derivative
-from soundmap.detect.sound_paths import NEAREST_M, Path, heard_places
+from soundmap.detect.sound_paths import NEAREST_M, Path, heard_places, waves_heard
 from soundmap.detect.sparse_fit import SparseFit
 from soundmap.geometry import FloatArray
 
@@ -32,9 +31,10 @@ def by_offsets(fit: SparseFit, velocity: FloatArray) -> Single:
         if not component.paths.gain[Path.DIRECT].any():
             continue
         strength = (component.strength[part] * evidence.handedness).astype(np.float32)
-        places = heard_places(fit.walls, component.place_m)
+        places, paths = heard_places(fit.walls, component.place_m), component.paths
         for path, share in zip(*component.taken(), strict=True):
-            turned = bearing_derivative(evidence, component.paths, path=path)
+            own = paths.wave[path], paths.aperture[path], paths.gain[path]
+            turned = waves_heard(evidence, *own, turned=True)
             turned *= np.float32(share) * strength
             if path == Path.DIRECT:
                 yaw -= turned

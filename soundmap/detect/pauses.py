@@ -85,7 +85,7 @@ def _told(fit: SparseFit, index: int) -> tuple[FloatArray, FloatArray]:
     """
     component = fit.components[index]
     own = fit.residual + fit.sound(component)
-    weighted = fit.weighted_columns()[index] / np.float32(fit.noise)
+    weighted = fit.weighted_column(index) / np.float32(fit.noise)
     starts = fit.evidence.table.starts[:-1]
     match = np.add.reduceat(weighted * own, starts, axis=1)
     energy = np.add.reduceat(weighted * component.column, starts, axis=1)

@@ -70,7 +70,7 @@ def _relocate(fit: SparseFit, component: Component, places_m: FloatArray, energy
     fit.components = [each for each in kept if each is not component]
     fit.add(place, float(HEIGHTS_M[int(np.argmax(value))]), Kind.SOURCE)
     fit.refit()
-    move(fit)
+    move(fit, only_places=True)
     if component.kind == Kind.SOURCE and fit.misfit > before:
         fit.components = kept
         fit.refit()

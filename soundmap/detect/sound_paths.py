@@ -12,7 +12,6 @@ on the same bearing, so that one wave stands for all of such a family.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -21,7 +20,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from soundmap.detect.evidence import Evidence
-from soundmap.detect.harmonics import APERTURES, Single
+from soundmap.detect.harmonics import Single, add, look_up
 from soundmap.geometry import FloatArray
 
 REACH_M = 9.0
@@ -122,18 +121,6 @@ def heard_places(walls: FloatArray, place_m: FloatArray) -> FloatArray:
     return np.concatenate(
         [np.tile(place_m, (Path.WALLS, 1)), place_m - 2.0 * off[:, None] * walls[:, :2]]
     )
-
-
-def mirrors(walls: FloatArray) -> FloatArray:
-    """How `heard_places` move as the source does, shape (P, 2, 2).
-
-    Parameters
-    ----------
-    walls : ndarray, shape (W, 3)
-    """
-    normal = walls[:, :2]
-    turned = np.eye(2) - 2.0 * normal[:, :, None] * normal[:, None]
-    return np.concatenate([np.tile(np.eye(2), (Path.WALLS, 1, 1)), turned])
 
 
 def departures(walls: FloatArray, place_m: FloatArray, stand_m: FloatArray) -> FloatArray:
@@ -248,71 +235,29 @@ def waves_heard(
     wave: FloatArray,
     aperture: FloatArray,
     gain: FloatArray,
-    scans: slice = slice(None),
-) -> Single:
-    """What a wave of power 1 at 1 m adds to each scan, in units of the noise, shape (S, D).
-
-    Parameters
-    ----------
-    evidence : Evidence
-    wave, aperture, gain : ndarray, shape (S,)
-        As in `Paths`, of the scans meant.
-    scans : slice, optional
-        Which they are.
-    """
-    return _sums_of_waves(evidence, wave[None], aperture[None], gain[None, None], scans, False)[0]
-
-
-def paths_heard(
-    evidence: Evidence,
-    paths: Paths,
-    chosen: Sequence[int],
-    share: FloatArray,
-    scans: slice = slice(None),
     *,
     turned: bool = False,
 ) -> Single:
-    """What some paths of a source of strength 1 add to some scans together, shape (K, S, D).
+    """What waves of power 1 at 1 m add to each scan, in units of the noise, shape (S, D).
 
     Parameters
     ----------
     evidence : Evidence
-    paths : Paths
-    chosen : sequence of int, length P
-        Which of them.
-    share : ndarray, shape (K, P, S) or one that broadcasts to it
-        How much of each path's gain K sums have.
-    scans : slice, optional
+    wave, aperture, gain : ndarray, shape (P, S), or (S,) for one wave
+        As in `Paths`.
     turned : bool
-        The change of that with the paths' bearings instead [1/rad].
+        How that changes with the waves' bearings instead [1/rad].
     """
-    index = list(chosen)
-    gain = paths.gain[index, scans]
-    gain = np.ascontiguousarray(np.broadcast_to(share * gain, (len(share), *gain.shape)))
-    wave, aperture = paths.wave[index, scans], paths.aperture[index, scans]
-    return _sums_of_waves(evidence, wave, aperture, gain, scans, turned)
-
-
-def _sums_of_waves(
-    evidence: Evidence,
-    wave: FloatArray,
-    aperture: FloatArray,
-    gain: FloatArray,
-    scans: slice,
-    turned: bool,
-) -> Single:
-    out = np.zeros((len(gain), gain.shape[2], evidence.heard.shape[1]), dtype=np.float32)
-    table = evidence.table
+    out, table = np.zeros_like(evidence.heard), evidence.table
     _add_waves(
         out,
         table.turned if turned else table.beams,
         table.starts,
-        APERTURES,
-        wave,
-        aperture,
-        gain,
-        evidence.turn_rad[scans] / (2.0 * np.pi) * table.waves,
-        evidence.weight[scans],
+        np.atleast_2d(wave),
+        np.atleast_2d(aperture),
+        np.atleast_2d(gain),
+        evidence.turn,
+        evidence.weight,
     )
     return out
 
@@ -322,54 +267,18 @@ def _add_waves(
     out: Single,
     beams: Single,
     starts: NDArray[np.int64],
-    apertures: FloatArray,
     wave: FloatArray,
     aperture: FloatArray,
     gain: FloatArray,
     turn: FloatArray,
     weight: FloatArray,
 ) -> None:
-    """Sums (K, S, D) over P waves, each interpolated between directions and apertures.
-
-    While the array turns the beam is smeared: three directions with the variance of an even turn
-    stand for it.
-    """
-    directions, size = beams.shape[1], beams.shape[2]
-    beam = np.empty(size, dtype=np.float32)
-    for s in range(wave.shape[1]):
-        step = turn[s] / np.sqrt(8.0)
-        looks = 3 if step > 0.2 else 1
+    """Sum (S, D) of P waves."""
+    beam, noise = np.empty(out.shape[1], np.float32), np.empty(out.shape[1], np.float32)
+    for s in range(len(out)):
+        for b in range(len(starts) - 1):
+            noise[starts[b] : starts[b + 1]] = weight[s, b]
         for p in range(len(wave)):
-            if not np.any(gain[:, p, s]):
-                continue
-            e = 0
-            while e < len(apertures) - 2 and apertures[e + 1] > aperture[p, s]:
-                e += 1
-            low = (apertures[e] - aperture[p, s]) / (apertures[e] - apertures[e + 1])
-            low = min(max(low, 0.0), 1.0)
-            beam[:] = 0.0
-            for j in range(looks):
-                at = wave[p, s] + (j - 1) * step if looks == 3 else wave[p, s]
-                at -= np.floor(at / directions) * directions
-                left = int(at)
-                share = at - left
-                left %= directions
-                right = (left + 1) % directions
-                for b in range(len(starts) - 1):
-                    one = weight[s, b] / looks
-                    a0, a1 = (
-                        np.float32((1 - low) * (1 - share) * one),
-                        np.float32((1 - low) * share * one),
-                    )
-                    b0, b1 = np.float32(low * (1 - share) * one), np.float32(low * share * one)
-                    for d in range(starts[b], starts[b + 1]):
-                        beam[d] += (
-                            a0 * beams[e, left, d]
-                            + a1 * beams[e, right, d]
-                            + b0 * beams[e + 1, left, d]
-                            + b1 * beams[e + 1, right, d]
-                        )
-            for k in range(len(out)):
-                factor = np.float32(gain[k, p, s])
-                for d in range(size):
-                    out[k, s, d] += factor * beam[d]
+            if gain[p, s] != 0.0:
+                look_up(beam, beams, noise, wave[p, s], aperture[p, s], turn[s])
+                add(out[s], gain[p, s], beam)

@@ -10,6 +10,7 @@ squares, not negative. Places move in `soundmap.detect.steps`.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -26,9 +27,10 @@ from soundmap.detect.sound_paths import (
     Path,
     Paths,
     departures,
-    paths_heard,
     sound_paths,
+    waves_heard,
 )
+from soundmap.detect.weighted_products import KnownProducts, weighted_products
 from soundmap.geometry import FloatArray
 
 LEAST_NOISE = 0.5
@@ -60,6 +62,8 @@ class SparseFit:
         Products of the components' columns with each other in each sub-band, in units of the noise.
     product : ndarray, shape (B, K)
         Theirs with what was heard; in both, the far field is taken out.
+    coupling : ndarray, shape (K, D)
+        Products of the components' columns with those of the far field.
     far_inverse : ndarray, shape (D, D)
         Inverse of the far field's own normal equations.
     far_pull : ndarray, shape (D,)
@@ -75,8 +79,8 @@ class SparseFit:
         self.far_heard: Single | None = None
         self.far_harmonics = np.zeros(int(evidence.table.starts[-1]))
         self._weigh(Precision(evidence, []))
-        self.gram = np.zeros((evidence.sub_bands, 0, 0))
-        self.product = np.zeros((evidence.sub_bands, 0))
+        self.gram, self.product = self._known.gram, self._known.heard
+        self.coupling = self._known.far
 
     @property
     def misfit(self) -> float:
@@ -134,30 +138,25 @@ class SparseFit:
         """Of all that a component adds to the scans."""
         return float(np.sum(self.sound(component) ** 2))
 
-    def weighted_columns(self) -> Single:
-        r""":math:`\Sigma^{-1}` times the columns of all components, shape (K, S, D)."""
-        new = [each for each in self.components if each.weighted_by is not self.precision]
-        if new:
-            weighted = self.precision.times(np.stack([each.column for each in new]))
-            couplings = self.far_field.pull(weighted)
-            for component, own, coupling in zip(new, weighted, couplings, strict=True):
-                component.weighted, component.weighted_by = own, self.precision
-                component.coupling = coupling
-        return np.stack([each.weighted for each in self.components if each.weighted is not None])
+    def weighted_column(self, index: int) -> Single:
+        r""":math:`\Sigma^{-1}` times the column of a component, shape (S, D)."""
+        return self.precision.times(self.components[index].column)
 
-    def couplings(self) -> FloatArray:
-        """Products of the components' weighted columns with those of the far field, (K, D)."""
-        told = [each.coupling for each in self.components if each.coupling is not None]
-        return np.array(told).reshape(len(self.components), len(self.far_pull))
+    def products(
+        self, columns: Callable[[slice], Single], others: Sequence[Single]
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """`weighted_products` as this fit weighs scans."""
+        return weighted_products(self.precision, self.far_field, columns, others)
 
     def pulls(self) -> Single:
         """What each number heard says for more strength of each component, shape (K, S, D).
 
         The far field follows the strengths, and its harmonics stand for D there.
         """
-        held = (self.couplings() @ self.far_inverse).astype(np.float32)
+        held = (self.coupling @ self.far_inverse).astype(np.float32)
         far = self.far_field.pulls(self.precision.times(self.residual))
-        return self.weighted_columns() * self.residual - held[:, None] * far
+        columns = np.stack([component.column for component in self.components])
+        return self.precision.times(columns) * self.residual - held[:, None] * far
 
     def misfit_of(self, components: list[Component]) -> float:
         """What would be left if there were only some of the components."""
@@ -165,8 +164,6 @@ class SparseFit:
 
     def renew(self) -> None:
         """Model errors as of the present strengths, and strengths as of these errors."""
-        for component in self.components:
-            component.weighted = component.weighted_by = component.coupling = None
         del self.precision  # it is large: the next one takes its room
         self._weigh(Precision(self.evidence, self.components, self.far_heard, self.errors))
         self.refit()
@@ -196,7 +193,7 @@ class SparseFit:
         """
         component = self.components[index]
         own = self.residual + self.sound(component)
-        weighted = self.weighted_columns()[index]
+        weighted = self.weighted_column(index)
         starts = self.evidence.table.starts[:-1]
         product = np.add.reduceat(weighted * own, starts, axis=1)
         energy = np.add.reduceat(weighted * component.column, starts, axis=1)
@@ -211,6 +208,7 @@ class SparseFit:
         """Take a precision, and with it all that does not hang on components."""
         heard, starts = self.evidence.heard, self.evidence.table.starts[:-1]
         self.precision = precision
+        self._known = KnownProducts.none(self.evidence.sub_bands, heard.shape[1])
         weighted = precision.times(heard)
         self.far_inverse = self.far_field.inverse(precision)
         self.far_pull = self.far_field.pull(weighted)
@@ -221,7 +219,7 @@ class SparseFit:
         """Fit the far field beside the components as they are, and see what is left."""
         part, pull = self.evidence.table.part, self.far_pull
         self.residual = self.evidence.heard.copy()
-        for component, coupling in zip(self.components, self.couplings(), strict=True):
+        for component, coupling in zip(self.components, self.coupling, strict=True):
             self.residual -= self.sound(component)
             pull = pull - component.strength[part] * coupling
         self.far_harmonics = self.far_inverse @ pull
@@ -241,10 +239,13 @@ class SparseFit:
     def _hear(self, component: Component) -> None:
         """Ways and column of a component that has new paths."""
         component.ways = self._ways(component)
-        component.weighted = component.weighted_by = None
         chosen, share = component.taken()
-        (component.column,) = paths_heard(
-            self.evidence, component.paths, chosen, share[None, :, None]
+        paths = component.paths
+        component.column = waves_heard(
+            self.evidence,
+            paths.wave[chosen],
+            paths.aperture[chosen],
+            share[:, None] * paths.gain[chosen],
         )
 
     def _ways(self, component: Component) -> dict[Share, list[int]]:
@@ -270,37 +271,25 @@ class SparseFit:
     def _fit_strengths(self) -> None:
         from scipy.optimize import nnls
 
-        count, bands = len(self.components), self.evidence.sub_bands
-        if count == 0:
-            self.gram, self.product = np.zeros((bands, 0, 0)), np.zeros((bands, 0))
-            self._explain()
-            return
-        columns = np.stack([component.column for component in self.components])
-        self.gram, self.product = self._products(columns, self.weighted_columns())
-        strengths = np.zeros((count, bands))
+        columns = [component.column for component in self.components]
+        self._known = known = self._known.of(columns, self.evidence.heard, self.products)
+        by_far = known.far @ self.far_inverse
+        self.coupling, self.gram, self.product = known.far, known.gram.copy(), known.heard.copy()
+        for band, (start, stop) in enumerate(pairwise(self.evidence.table.starts)):
+            held = by_far[:, start:stop]
+            self.gram[band] -= held @ self.coupling[:, start:stop].T
+            self.product[band] -= held @ self.far_pull[start:stop]
+        self.gram = 0.5 * (self.gram + self.gram.swapaxes(1, 2))
+        strengths = np.zeros((len(self.components), self.evidence.sub_bands))
         for band, (gram, product) in enumerate(zip(self.gram, self.product, strict=True)):
+            if not len(gram):
+                continue
             root, scale = _scaled_root(gram)
             solved, _ = nnls(root.T, np.linalg.solve(root, product * scale))
             strengths[:, band] = solved * scale
         for component, strength in zip(self.components, strengths, strict=True):
             component.strength = strength
         self._explain()
-
-    def _products(self, columns: Single, weighted: Single) -> tuple[FloatArray, FloatArray]:
-        """Gram matrices (B, K, K) of columns, and their products (B, K) with what was heard."""
-        starts, heard = self.evidence.table.starts, self.evidence.heard
-        couplings = self.couplings()
-        held = couplings @ self.far_inverse
-        grams, products = [], []
-        for start, stop in pairwise(starts):
-            right = weighted[:, :, start:stop].reshape(len(columns), -1)
-            left = columns[:, :, start:stop].reshape(len(columns), -1)
-            gram = (right @ left.T).astype(np.float64)
-            gram -= held[:, start:stop] @ couplings[:, start:stop].T
-            grams.append(0.5 * (gram + gram.T))
-            product = (right @ heard[:, start:stop].ravel()).astype(np.float64)
-            products.append(product - held[:, start:stop] @ self.far_pull[start:stop])
-        return np.array(grams), np.array(products)
 
     def _misfit(self, kept: list[int]) -> float:
         """Misfit with some components only, their strengths as fits best."""

@@ -11,26 +11,29 @@ from itertools import pairwise
 import numpy as np
 
 from soundmap.detect.component import Component
-from soundmap.detect.harmonics import Single
-from soundmap.detect.model_errors import parts
 from soundmap.detect.sound_paths import NEAREST_M, Kind, Path
 from soundmap.detect.sparse_fit import SparseFit
 from soundmap.detect.unknowns import PLACE, Owner, change, derivatives, held, unknowns
 from soundmap.geometry import FloatArray
-from soundmap.side_by_side import side_by_side
 
 MAY_BE_BEHIND_M, HOLD_BEHIND = 0.03, 3000.0
 """A source farther behind a surface than this [m] is drawn back to it so firmly [1/m^2]: what the
 lasers see hides what lies behind, and reflections in the wall pull sources into it."""
 
 
-def move(fit: SparseFit, chosen: list[Component] | None = None, *, share: float = 1.0) -> None:
+def move(
+    fit: SparseFit,
+    chosen: list[Component] | None = None,
+    *,
+    share: float = 1.0,
+    only_places: bool = False,
+) -> None:
     """One step of some (by default all) components to where bearings point, and a refit.
 
-    Only a ``share`` of the step is taken.
+    Only a ``share`` of the step is taken, or ``only_places`` move and all else stays as it is.
     """
     chosen = fit.components if chosen is None else chosen
-    hessian, gradient, owners = _system(fit, chosen)
+    hessian, gradient, owners = _system(fit, chosen, only_places)
     if not owners:
         return
     scale = np.sqrt(np.diag(hessian)) + 1e-12
@@ -80,47 +83,34 @@ def place_covariances(fit: SparseFit) -> list[FloatArray]:
     return result
 
 
-def _system(fit: SparseFit, chosen: list[Component]) -> tuple[FloatArray, FloatArray, list[Owner]]:
+def _system(
+    fit: SparseFit, chosen: list[Component], only_places: bool = False
+) -> tuple[FloatArray, FloatArray, list[Owner]]:
     """Normal equations of all unknowns of some components, strengths free.
 
     The strengths' own unknowns stand last, sub-band by sub-band; only the first ones have
     owners.
     """
-    owners = unknowns(chosen, directed=fit.directed)
+    owners = unknowns(chosen, directed=fit.directed, only_places=only_places)
     if not owners:
         return np.zeros((0, 0)), np.zeros(0), owners
-    count, components, bands = len(owners), len(fit.components), len(fit.gram)
-    hessian = np.zeros((count + bands * components,) * 2)
-    gradient = np.zeros(len(hessian))
-    coupling = np.zeros((count, len(fit.far_pull)))
-
-    def of_some(scans: slice) -> tuple[Single, Single, FloatArray, FloatArray]:
-        own = np.stack(list(derivatives(fit, owners, scans)))
-        weighted = fit.precision.times(own, scans)
-        flat = weighted.reshape(count, -1)
-        squares = flat @ own.reshape(count, -1).T
-        pull = flat @ fit.residual[scans].ravel()
-        return (
-            squares,
-            pull,
-            _across(fit, weighted, scans),
-            fit.far_field.pull(weighted, scans),
-        )
-
-    for squares, pull, across, far in side_by_side(of_some, parts(len(fit.evidence))):
-        hessian[:count, :count] += squares
-        gradient[:count] += pull
-        hessian[:count, count:] += across
-        coupling += far
-    by_far = coupling @ fit.far_inverse
-    hessian[:count, :count] -= by_far @ coupling.T
-    couplings = fit.couplings()
+    count, components = len(owners), fit.components
+    own, across, far = fit.products(
+        lambda scans: derivatives(fit, owners, scans),
+        [*(component.column for component in components), fit.residual],
+    )
+    size = count + len(fit.gram) * len(components)
+    hessian, gradient = np.zeros((size, size)), np.zeros(size)
+    by_far = far @ fit.far_inverse
+    hessian[:count, :count] = own.sum(axis=0) - by_far @ far.T
+    gradient[:count] = across[:, :, -1].sum(axis=0)
     for band, (start, stop) in enumerate(pairwise(fit.evidence.table.starts)):
-        place = slice(count + band * components, count + (band + 1) * components)
-        hessian[:count, place] -= by_far[:, start:stop] @ couplings[:, start:stop].T
+        place = slice(count + band * len(components), count + (band + 1) * len(components))
+        held_by_far = by_far[:, start:stop] @ fit.coupling[:, start:stop].T
+        hessian[:count, place] = across[band, :, :-1] - held_by_far
     hessian[count:, :count] = hessian[:count, count:].T
     for band, gram in enumerate(fit.gram):
-        place = slice(count + band * components, count + (band + 1) * components)
+        place = slice(count + band * len(components), count + (band + 1) * len(components))
         hessian[place, place] = gram
     rest = fit.product - np.einsum("bkl,lb->bk", fit.gram, fit.strengths)
     gradient[count:] = rest.ravel()
@@ -148,17 +138,3 @@ def _hold_in_view(
     if behind > 0.0:
         hessian[own, own] += HOLD_BEHIND * np.outer(toward, toward)
         gradient[own] -= HOLD_BEHIND * behind * toward
-
-
-def _across(fit: SparseFit, weighted: Single, scans: slice) -> FloatArray:
-    """Products of some columns (K', s, D) with those of all components, (K', B K)."""
-    starts, count = fit.evidence.table.starts, len(weighted)
-    columns = np.stack([component.column[scans] for component in fit.components])
-    return np.concatenate(
-        [
-            weighted[:, :, start:stop].reshape(count, -1)
-            @ columns[:, :, start:stop].reshape(len(columns), -1).T
-            for start, stop in pairwise(starts)
-        ],
-        axis=1,
-    )

@@ -7,23 +7,18 @@ directivity as much as of distance.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import groupby
 
 import numpy as np
+from numba import njit
+from numpy.typing import NDArray
 
 from soundmap.detect.component import ASSUMED, SHARE_SIGMA, Component, Share
-from soundmap.detect.harmonics import Single
-from soundmap.detect.sound_paths import (
-    NEAREST_M,
-    Kind,
-    Path,
-    departures,
-    heard_places,
-    mirrors,
-    paths_heard,
-)
+from soundmap.detect.harmonics import Single, add, look_up
+from soundmap.detect.sound_paths import NEAREST_M, Kind, Path
 from soundmap.detect.sparse_fit import SparseFit
+from soundmap.geometry import FloatArray
 
 PLACE, LOBE = (0, 1), (5, 6)
 """Axes of a component: its place along x and y, and its directivity along x and y. Those in between
@@ -39,7 +34,9 @@ Owner = tuple[Component, int]
 """A component and one of its axes."""
 
 
-def unknowns(chosen: Sequence[Component], *, directed: bool) -> list[Owner]:
+def unknowns(
+    chosen: Sequence[Component], *, directed: bool, only_places: bool = False
+) -> list[Owner]:
     """Places, shares and, if they are ``directed``, directivities of those that enough scans hear.
 
     Mirror images have no directivity: what they mirror is not known.
@@ -48,7 +45,8 @@ def unknowns(chosen: Sequence[Component], *, directed: bool) -> list[Owner]:
     for component in chosen:
         if np.count_nonzero(component.paths.gain[Path.DIRECT]) >= 3:
             lobe = LOBE if directed and component.kind == Kind.SOURCE else ()
-            owners += [(component, axis) for axis in (*PLACE, *component.ways, *lobe)]
+            others = () if only_places else (*component.ways, *lobe)
+            owners += [(component, axis) for axis in (*PLACE, *others)]
     return owners
 
 
@@ -78,52 +76,110 @@ def change(owner: Owner, step: float) -> None:
         component.shares[Share(axis)] = float(np.clip(share, LEAST_SHARE, GREATEST_SHARE))
 
 
-def derivatives(fit: SparseFit, owners: Sequence[Owner], scans: slice) -> Iterator[Single]:
-    """Change of what some scans hear with each unknown, each (s, D).
+def derivatives(fit: SparseFit, owners: Sequence[Owner], scans: slice) -> Single:
+    """Change of what some scans hear with each unknown, shape (U, s, D).
 
     Parameters
     ----------
     fit : SparseFit
-    owners : sequence of tuple
+    owners : sequence of tuple, length U
         The unknowns, those of a component one after the other.
     scans : slice
     """
-    for _, group in groupby(owners, key=lambda owner: id(owner[0])):
-        of_one = list(group)
-        component, axes = of_one[0][0], [axis for _, axis in of_one]
-        strength = component.strength[fit.evidence.table.part].astype(np.float32)
-        changes: dict[int, Single] = {}
-        if not set(axes).isdisjoint(PLACE):
-            changes |= zip(PLACE, _by_place(fit, component, scans), strict=True)
-        if not set(axes).isdisjoint(LOBE):
-            changes |= zip(LOBE, _by_directivity(fit, component, scans), strict=True)
-        for axis in axes:
-            own = changes[axis] if axis in changes else _by_share(fit, component, axis, scans)
-            yield own * strength
-
-
-def _by_share(fit: SparseFit, component: Component, axis: int, scans: slice) -> Single:
-    """Change with a share at strength 1, shape (s, D)."""
-    paths = component.ways[Share(axis)]
-    return paths_heard(fit.evidence, component.paths, paths, np.ones((1, 1, 1)), scans)[0]
-
-
-def _by_place(fit: SparseFit, component: Component, scans: slice) -> Single:
-    """Change with the place at strength 1 by the bearings of all paths, shape (2, s, D)."""
-    chosen, share = component.taken()
-    stand = fit.evidence.place_m[scans]
-    step = heard_places(fit.walls, component.place_m)[chosen, None] - stand
-    square = np.maximum(np.sum(step**2, axis=2), NEAREST_M**2) / fit.evidence.handedness
-    across = np.stack([-step[..., 1], step[..., 0]], axis=-1) @ mirrors(fit.walls)[chosen]
-    bearing = share[:, None, None] * across / square[..., None]
-    return paths_heard(
-        fit.evidence, component.paths, chosen, np.moveaxis(bearing, 2, 0), scans, turned=True
+    evidence, table = fit.evidence, fit.evidence.table
+    components = [component for component, _ in groupby(owner for owner, _ in owners)]
+    part_of = np.zeros((len(components), len(components[0].paths.gain)))
+    of_share = np.zeros((len(owners), part_of.shape[1]), dtype=np.bool_)
+    for component, parts in zip(components, part_of, strict=True):
+        chosen, share = component.taken()
+        parts[chosen] = share
+    for (component, axis), own in zip(owners, of_share, strict=True):
+        if axis not in (*PLACE, *LOBE):
+            own[component.ways[Share(axis)]] = True
+    number = {id(component): index for index, component in enumerate(components)}
+    paths = [component.paths for component in components]
+    told = np.zeros((len(owners), *evidence.heard[scans].shape), dtype=np.float32)
+    _add_changes(
+        told,
+        np.array([number[id(component)] for component, _ in owners]),
+        np.array([axis for _, axis in owners]),
+        part_of,
+        of_share,
+        np.array([component.place_m for component in components]),
+        np.array([component.strength for component in components]),
+        fit.walls,
+        evidence.place_m[scans],
+        float(evidence.handedness),
+        np.stack([each.wave[:, scans] for each in paths]),
+        np.stack([each.aperture[:, scans] for each in paths]),
+        np.stack([each.gain[:, scans] for each in paths]),
+        table.beams,
+        table.turned,
+        table.starts,
+        evidence.turn[scans],
+        evidence.weight[scans],
     )
+    return told
 
 
-def _by_directivity(fit: SparseFit, component: Component, scans: slice) -> Single:
-    """Change with the directivity at strength 1, shape (2, s, D)."""
-    chosen, share = component.taken()
-    toward = departures(fit.walls, component.place_m, fit.evidence.place_m[scans])[chosen]
-    weight = np.moveaxis(share[:, None, None] * toward, 2, 0)
-    return paths_heard(fit.evidence, component.paths, chosen, weight, scans)
+@njit(cache=True, nogil=True)
+def _add_changes(
+    out: Single,
+    number: NDArray[np.int64],
+    axes: NDArray[np.int64],
+    part_of: FloatArray,
+    of_share: NDArray[np.bool_],
+    place: FloatArray,
+    strength: FloatArray,
+    walls: FloatArray,
+    stand: FloatArray,
+    hand: float,
+    wave: FloatArray,
+    aperture: FloatArray,
+    gain: FloatArray,
+    beams: Single,
+    turned: Single,
+    starts: NDArray[np.int64],
+    turn: FloatArray,
+    weight: FloatArray,
+) -> None:
+    """Derivatives (U, s, D), path by path.
+
+    Of U unknowns, ``number`` is that of the component, ``of_share`` (U, P) tells the paths that
+    have the share. ``part_of`` (C, P) is the part of a component's power that takes a path.
+    """
+    beam, turning, noise = np.empty((3, out.shape[2]), np.float32)
+    last = 0
+    for c in range(len(place)):
+        first = last
+        while last < len(number) and number[last] == c:
+            last += 1
+        for s in range(len(stand)):
+            for b in range(len(starts) - 1):
+                noise[starts[b] : starts[b + 1]] = weight[s, b] * strength[c, b]
+            for p in range(part_of.shape[1]):
+                part, loud = part_of[c, p], gain[c, p, s]
+                if loud == 0.0 or (part == 0.0 and not of_share[first:last, p].any()):
+                    continue
+                dx, dy, sense = place[c, 0] - stand[s, 0], place[c, 1] - stand[s, 1], hand
+                at, cos = wave[c, p, s], aperture[c, p, s]
+                look_up(beam, beams, noise, at, cos, turn[s])
+                look_up(turning, turned, noise, at, cos, turn[s])
+                if p >= Path.WALLS:  # the way to the source in the mirror, mirrored back
+                    nx, ny, offset = walls[p - Path.WALLS]
+                    off = nx * stand[s, 0] + ny * stand[s, 1] - offset
+                    dx, dy, sense = dx + 2.0 * off * nx, dy + 2.0 * off * ny, -hand
+                distance = max(np.sqrt(dx * dx + dy * dy), 1e-9)
+                bent = sense * part * loud / max(distance, NEAREST_M) ** 2
+                sent = part * loud / distance
+                for u in range(first, last):
+                    if axes[u] == PLACE[0]:
+                        add(out[u, s], -bent * dy, turning)
+                    elif axes[u] == PLACE[1]:
+                        add(out[u, s], bent * dx, turning)
+                    elif axes[u] == LOBE[0]:
+                        add(out[u, s], -sent * dx, beam)
+                    elif axes[u] == LOBE[1]:
+                        add(out[u, s], -sent * dy, beam)
+                    elif of_share[u, p]:
+                        add(out[u, s], loud, beam)
