@@ -20,9 +20,10 @@ from numba import njit, prange
 
 from soundmap.detect.evidence import Evidence
 from soundmap.detect.harmonics import APERTURES, Single
-from soundmap.detect.model_errors import Precision
+from soundmap.detect.model_errors import Precision, parts
 from soundmap.detect.sound_paths import NEAREST_M, REACH_M, Kind, seen
 from soundmap.geometry import FloatArray
+from soundmap.side_by_side import side_by_side
 
 HEIGHTS_M = np.array([0.2, 0.6, 1.1])
 """Heights between array and source that are tried [m]."""
@@ -32,7 +33,7 @@ COARSE = 3
 """Directions between those at which energies are worked out."""
 LEAST_SCANS = 8.0
 """A place that fewer scans (effective number) tell of is no candidate."""
-MANY = 1000
+MANY = 100
 """Places from which on the work is shared among cores; for fewer the sharing costs more."""
 
 
@@ -60,12 +61,17 @@ def matched_scans(evidence: Evidence, residual: Single, precision: Precision) ->
 
 def beam_matches(evidence: Evidence, weighted: Single) -> Single:
     r"""Products of all beams with :math:`\Sigma^{-1} r` (S, D), shape (S, B, E, M)."""
-    beams, starts = evidence.table.beams, evidence.table.starts
+    beams = evidence.table.beams
     apertures, waves, _ = beams.shape
     match = np.empty((len(evidence), evidence.sub_bands, apertures, waves), dtype=np.float32)
-    for band, (start, stop) in enumerate(pairwise(starts)):
-        beam = beams[:, :, start:stop].reshape(apertures * waves, -1)
-        match[:, band] = (weighted[:, start:stop] @ beam.T).reshape(-1, apertures, waves)
+
+    def fill(scans: slice) -> None:
+        for band, own in enumerate(pairwise(evidence.table.starts)):
+            beam = beams[:, :, slice(*own)].reshape(apertures * waves, -1)
+            product = weighted[scans, slice(*own)] @ beam.T
+            match[scans, band] = product.reshape(-1, apertures, waves)
+
+    side_by_side(fill, parts(len(evidence)))
     return match
 
 
@@ -74,11 +80,16 @@ def beam_energies(evidence: Evidence, precision: Precision) -> Single:
     beams, starts = evidence.table.beams, evidence.table.starts
     count = beams.shape[1] // COARSE
     energy = np.empty((len(evidence), evidence.sub_bands, len(CLASSES), count), dtype=np.float32)
-    for band, inverse in enumerate(precision.inverse):
-        for index, aperture in enumerate(CLASSES):
-            few = beams[aperture, : count * COARSE : COARSE, starts[band] : starts[band + 1]]
-            few = np.ascontiguousarray(few)
-            energy[:, band, index] = np.einsum("smd,md->sm", np.matmul(few, inverse), few)
+
+    def fill(scans: slice) -> None:
+        for band, inverse in enumerate(precision.inverse):
+            for index, aperture in enumerate(CLASSES):
+                few = beams[aperture, : count * COARSE : COARSE, starts[band] : starts[band + 1]]
+                few = np.ascontiguousarray(few)
+                weighted = np.matmul(few, inverse[scans])
+                energy[scans, band, index] = np.einsum("smd,md->sm", weighted, few)
+
+    side_by_side(fill, parts(len(evidence)))
     return energy
 
 

@@ -148,7 +148,8 @@ def _add_changes(
     Of U unknowns, ``number`` is that of the component, ``of_share`` (U, P) tells the paths that
     have the share. ``part_of`` (C, P) is the part of a component's power that takes a path.
     """
-    beam, turning, noise = np.empty((3, out.shape[2]), np.float32)
+    beam, turning = np.empty(out.shape[2], np.float32), np.empty(out.shape[2], np.float32)
+    noise = np.empty(out.shape[2], np.float32)
     last = 0
     for c in range(len(place)):
         first = last
