@@ -148,13 +148,14 @@ class FarFieldBand:
     def pull(self, weighted: Single, scans: slice) -> Single:
         """Sum of the columns' products with others (..., s, d), shape (..., d)."""
         both = np.ascontiguousarray(weighted) @ self._by_both
-        told = np.zeros((both[..., 0, :].size // both.shape[-1], both.shape[-1]), np.float32)
-        _add_turned(told, both.reshape(-1, *both.shape[-2:]), self._cos[scans], self._sin[scans])
-        return told.reshape(*both.shape[:-2], -1)
+        told = np.zeros((*both.shape[:-2], both.shape[-1]), dtype=np.float32)
+        flat = told.reshape(-1, told.shape[-1]), both.reshape(-1, *both.shape[-2:])
+        _add_turned(*flat, self._cos[scans], self._sin[scans])
+        return told
 
     def pulls(self, weighted: Single) -> Single:
         """The columns' products with another (S, d), scan by scan, shape (S, d)."""
-        even, odd = weighted @ self._by_cos, weighted @ self._by_sin
+        even, odd = np.split(weighted @ self._by_both, 2, axis=-1)
         return np.hstack([self._cos * even - self._sin * odd, self._sin * even + self._cos * odd])
 
     def heard(self, field: Single) -> Single:

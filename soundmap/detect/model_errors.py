@@ -151,8 +151,8 @@ class Precision:
 
 def parts(scans: int) -> list[slice]:
     """Scans that are worked on at once: even parts of them, an even number of these."""
-    count = 2 * -(-scans // (2 * SCANS_AT_ONCE))
-    edges = [scans * i // count for i in range(count + 1)]
+    count = min(2 * -(-scans // (2 * SCANS_AT_ONCE)), scans)
+    edges = [scans * i // max(count, 1) for i in range(count + 1)]
     return [slice(*edge) for edge in pairwise(edges)]
 
 

@@ -105,13 +105,11 @@ def _system(
     hessian[:count, :count] = own.sum(axis=0) - by_far @ far.T
     gradient[:count] = across[:, :, -1].sum(axis=0)
     for band, (start, stop) in enumerate(pairwise(fit.evidence.table.starts)):
-        place = slice(count + band * len(components), count + (band + 1) * len(components))
-        held_by_far = by_far[:, start:stop] @ fit.coupling[:, start:stop].T
-        hessian[:count, place] = across[band, :, :-1] - held_by_far
+        strengths = slice(count + band * len(components), count + (band + 1) * len(components))
+        by_far_field = by_far[:, start:stop] @ fit.coupling[:, start:stop].T
+        hessian[:count, strengths] = across[band, :, :-1] - by_far_field
+        hessian[strengths, strengths] = fit.gram[band]
     hessian[count:, :count] = hessian[:count, count:].T
-    for band, gram in enumerate(fit.gram):
-        place = slice(count + band * len(components), count + (band + 1) * len(components))
-        hessian[place, place] = gram
     rest = fit.product - np.einsum("bkl,lb->bk", fit.gram, fit.strengths)
     gradient[count:] = rest.ravel()
     for position, owner in enumerate(owners):

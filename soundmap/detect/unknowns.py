@@ -8,7 +8,6 @@ directivity as much as of distance.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import groupby
 
 import numpy as np
 from numba import njit
@@ -87,21 +86,20 @@ def derivatives(fit: SparseFit, owners: Sequence[Owner], scans: slice) -> Single
     scans : slice
     """
     evidence, table = fit.evidence, fit.evidence.table
-    components = [component for component, _ in groupby(owner for owner, _ in owners)]
-    part_of = np.zeros((len(components), len(components[0].paths.gain)))
-    of_share = np.zeros((len(owners), part_of.shape[1]), dtype=np.bool_)
+    components = list(dict.fromkeys(component for component, _ in owners))
+    paths = [component.paths for component in components]
+    part_of = np.zeros((len(components), len(paths[0].gain)))
     for component, parts in zip(components, part_of, strict=True):
         chosen, share = component.taken()
         parts[chosen] = share
+    of_share = np.zeros((len(owners), len(paths[0].gain)), dtype=np.bool_)
     for (component, axis), own in zip(owners, of_share, strict=True):
         if axis not in (*PLACE, *LOBE):
             own[component.ways[Share(axis)]] = True
-    number = {id(component): index for index, component in enumerate(components)}
-    paths = [component.paths for component in components]
     told = np.zeros((len(owners), *evidence.heard[scans].shape), dtype=np.float32)
     _add_changes(
         told,
-        np.array([number[id(component)] for component, _ in owners]),
+        np.array([components.index(component) for component, _ in owners]),
         np.array([axis for _, axis in owners]),
         part_of,
         of_share,

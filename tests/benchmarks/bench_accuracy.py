@@ -2,7 +2,7 @@
 
     python tests/benchmarks/bench_accuracy.py --cache /tmp/scenes --half tuning
 
-Even seeds are the tuning half, odd ones from 31001 on the judging half: look at the judging half
+Even seeds are the tuning half, odd ones from 33001 on the judging half: look at the judging half
 only to judge, and take fresh seeds once it has been looked at. Scenes are simulated once and kept
 in the cache. The start pose given to the program is the true one, off by 8 cm and 2 degrees or so;
 trajectories are estimated. A source counts as detected when a row of sources.csv lies within 0.5 m
@@ -39,8 +39,8 @@ from soundmap.run import Run
 from soundmap.simulate.simulation import simulated_run
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
-FIRST_SEED = {"tuning": 0, "judging": 31001}
-FIRST_SILENT_SEED = {"tuning": 100, "judging": 32001}
+FIRST_SEED = {"tuning": 0, "judging": 33001}
+FIRST_SILENT_SEED = {"tuning": 100, "judging": 34001}
 
 
 @dataclass(frozen=True)
