@@ -85,11 +85,6 @@ class Evidence:
         """B, parts of the band that are told apart."""
         return self.weight.shape[1]
 
-    @property
-    def turn(self) -> FloatArray:
-        """`turn_rad` in steps of the beams' directions, shape (S,)."""
-        return self.turn_rad * (self.table.waves / (2.0 * np.pi))
-
     def chosen(self, scans: NDArray[np.int64]) -> Evidence:
         """Some of the scans."""
         return Evidence(

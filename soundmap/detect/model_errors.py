@@ -25,12 +25,11 @@ from typing import Protocol
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from soundmap.detect.evidence import Evidence
 from soundmap.detect.harmonics import Single, add, look_up
 from soundmap.detect.inversion import inverse_covariances
-from soundmap.detect.sound_paths import Path, Paths
+from soundmap.detect.sound_paths import Path, Paths, Waves, waves_to, weigh
 from soundmap.geometry import FloatArray
 from soundmap.side_by_side import side_by_side
 
@@ -163,33 +162,19 @@ def _modes(
 
     Last the variance (s, D) of noise and of harmonics that err one by one.
     """
-    table, stand = evidence.table, evidence.heard[scans]
     paths = [component.paths for component in components]
-    count = len(paths) * (len(paths[0].gain) + 2)
-    modes = np.zeros((count, *stand.shape), dtype=np.float32)
-    energy = np.zeros((count, evidence.sub_bands), dtype=np.float32)
-    variance = np.ones(stand.shape, dtype=np.float32)
+    strength = np.array([component.strength for component in components])
+    waves = waves_to(evidence, paths, strength, scans)
+    stand = evidence.heard[scans].shape
+    modes = np.zeros((len(paths) * (len(paths[0].gain) + 2), *stand), dtype=np.float32)
+    energy = np.zeros((len(modes), evidence.sub_bands), dtype=np.float32)
+    variance = np.ones(stand, dtype=np.float32)
     size = np.full(len(paths[0].gain), errors.reflection)
     size[Path.DIRECT], size[Path.HIDDEN] = errors.strength, HIDDEN_ERROR
     alone = np.full(len(size), errors.harmonic * REFLECTED)
     alone[[Path.DIRECT, Path.FLOOR, Path.HIDDEN]] = errors.harmonic, 0.0, 0.0
-    _add_modes(
-        modes,
-        energy,
-        variance,
-        size,
-        alone,
-        errors.bearing * table.width_rad,
-        np.array([component.strength for component in components]),
-        np.stack([each.wave[:, scans] for each in paths]),
-        np.stack([each.aperture[:, scans] for each in paths]),
-        np.stack([each.gain[:, scans] for each in paths]),
-        table.beams,
-        table.turned,
-        table.starts,
-        evidence.turn[scans],
-        evidence.weight[scans],
-    )
+    bearing = errors.bearing * evidence.table.width_rad
+    _add_modes(modes, energy, variance, waves, size, alone, bearing)
     return modes, energy, variance
 
 
@@ -198,36 +183,29 @@ def _add_modes(
     modes: Single,
     energy: Single,
     variance: Single,
+    waves: Waves,
     size: FloatArray,
     alone: FloatArray,
     bearing: FloatArray,
-    strength: FloatArray,
-    wave: FloatArray,
-    aperture: FloatArray,
-    gain: FloatArray,
-    beams: Single,
-    turned: Single,
-    starts: NDArray[np.int64],
-    turn: FloatArray,
-    weight: FloatArray,
 ) -> None:
-    """Modes of C components: one for each path, then those of bearing and elevation.
+    """Modes of each component: one for each path, then those of bearing and elevation.
 
     ``size`` and ``alone`` are errors of what each path brings, as a whole and harmonic by harmonic,
     ``bearing`` those of the bearing [rad].
     """
     beam, noise = np.empty(modes.shape[2], np.float32), np.empty(modes.shape[2], np.float32)
-    paths = len(size)
-    for c in range(len(strength)):
+    components, paths, scans = waves.gain.shape
+    starts = waves.starts
+    for c in range(components):
         first = c * (paths + 2)
-        for s in range(len(turn)):
-            for b in range(len(starts) - 1):
-                noise[starts[b] : starts[b + 1]] = weight[s, b] * strength[c, b]
+        for s in range(scans):
+            weigh(noise, waves, c, s)
             for p in range(paths):
-                loud, at, cos = gain[c, p, s], wave[c, p, s], aperture[c, p, s]
+                loud = waves.gain[c, p, s]
                 if loud == 0.0:
                     continue
-                look_up(beam, beams, noise, at, cos, turn[s])
+                at, cos, turn = waves.wave[c, p, s], waves.aperture[c, p, s], waves.turn[s]
+                look_up(beam, waves.beams, noise, at, cos, turn)
                 add(modes[first + p, s], loud * size[p], beam)
                 if alone[p] > 0.0:
                     share = np.float32((loud * alone[p]) ** 2)
@@ -236,9 +214,9 @@ def _add_modes(
                 if p == Path.DIRECT:
                     lowered = modes[first + paths + 1, s]
                     add(lowered, loud, beam)
-                    look_up(beam, beams, noise, at, cos - APERTURE_ERROR, turn[s])
+                    look_up(beam, waves.beams, noise, at, cos - APERTURE_ERROR, turn)
                     add(lowered, -loud, beam)
-                    look_up(beam, turned, noise, at, cos, turn[s])
+                    look_up(beam, waves.turned, noise, at, cos, turn)
                     for b in range(len(starts) - 1):
                         start, stop = starts[b], starts[b + 1]
                         bent = modes[first + paths, s, start:stop]

@@ -12,8 +12,10 @@ on the same bearing, so that one wave stands for all of such a family.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -230,6 +232,60 @@ def _paths(
     return wave, aperture, gain, beyond
 
 
+class Waves(NamedTuple):
+    """Waves from C sources along P paths to S scans, as kernels take them.
+
+    Attributes
+    ----------
+    wave, aperture, gain : ndarray, shape (C, P, S)
+        As in `Paths`.
+    strength : ndarray, shape (C, B)
+        Of the sources, mean square at 1 m.
+    beams, turned : ndarray of float32, shape (E, M, D)
+        As in `BeamTable`; ``starts`` (B + 1,) is, too.
+    turn : ndarray, shape (S,)
+        How far the array turned, in steps of the beams' directions.
+    weight : ndarray, shape (S, B)
+        One over the noise.
+    """
+
+    wave: FloatArray
+    aperture: FloatArray
+    gain: FloatArray
+    strength: FloatArray
+    beams: Single
+    turned: Single
+    starts: NDArray[np.int64]
+    turn: FloatArray
+    weight: FloatArray
+
+
+def waves_to(
+    evidence: Evidence, paths: Sequence[Paths], strength: FloatArray, scans: slice
+) -> Waves:
+    """Those along all paths of some sources, of strengths (C, B), to some scans."""
+    table = evidence.table
+    return Waves(
+        np.stack([each.wave[:, scans] for each in paths]),
+        np.stack([each.aperture[:, scans] for each in paths]),
+        np.stack([each.gain[:, scans] for each in paths]),
+        strength,
+        table.beams,
+        table.turned,
+        table.starts,
+        evidence.turn_rad[scans] * (table.waves / (2.0 * np.pi)),
+        evidence.weight[scans],
+    )
+
+
+@njit(cache=True, nogil=True)
+def weigh(noise: Single, waves: Waves, source: int, scan: int) -> None:
+    """Put what a source's strength is in units of the noise into an array (D,)."""
+    for b in range(len(waves.starts) - 1):
+        own = waves.weight[scan, b] * waves.strength[source, b]
+        noise[waves.starts[b] : waves.starts[b + 1]] = own
+
+
 def waves_heard(
     evidence: Evidence,
     wave: FloatArray,
@@ -248,37 +304,22 @@ def waves_heard(
     turned : bool
         How that changes with the waves' bearings instead [1/rad].
     """
-    out, table = np.zeros_like(evidence.heard), evidence.table
-    _add_waves(
-        out,
-        table.turned if turned else table.beams,
-        table.starts,
-        np.atleast_2d(wave),
-        np.atleast_2d(aperture),
-        np.atleast_2d(gain),
-        evidence.turn,
-        evidence.weight,
-    )
+    paths = Paths(np.atleast_2d(wave), np.atleast_2d(aperture), np.atleast_2d(gain), np.empty(0))
+    waves = waves_to(evidence, [paths], np.ones((1, evidence.sub_bands)), slice(None))
+    out = np.zeros_like(evidence.heard)
+    _add_waves(out, waves, waves.turned if turned else waves.beams)
     return out
 
 
 @njit(cache=True, nogil=True)
-def _add_waves(
-    out: Single,
-    beams: Single,
-    starts: NDArray[np.int64],
-    wave: FloatArray,
-    aperture: FloatArray,
-    gain: FloatArray,
-    turn: FloatArray,
-    weight: FloatArray,
-) -> None:
-    """Sum (S, D) of P waves."""
+def _add_waves(out: Single, waves: Waves, beams: Single) -> None:
+    """Sum (S, D) of the waves of one source."""
     beam, noise = np.empty(out.shape[1], np.float32), np.empty(out.shape[1], np.float32)
     for s in range(len(out)):
-        for b in range(len(starts) - 1):
-            noise[starts[b] : starts[b + 1]] = weight[s, b]
-        for p in range(len(wave)):
-            if gain[p, s] != 0.0:
-                look_up(beam, beams, noise, wave[p, s], aperture[p, s], turn[s])
-                add(out[s], gain[p, s], beam)
+        weigh(noise, waves, 0, s)
+        for p in range(waves.gain.shape[1]):
+            loud = waves.gain[0, p, s]
+            if loud != 0.0:
+                at, cos = waves.wave[0, p, s], waves.aperture[0, p, s]
+                look_up(beam, beams, noise, at, cos, waves.turn[s])
+                add(out[s], loud, beam)

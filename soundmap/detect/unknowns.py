@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from soundmap.detect.component import ASSUMED, SHARE_SIGMA, Component, Share
 from soundmap.detect.harmonics import Single, add, look_up
-from soundmap.detect.sound_paths import NEAREST_M, Kind, Path
+from soundmap.detect.sound_paths import NEAREST_M, Kind, Path, Waves, waves_to, weigh
 from soundmap.detect.sparse_fit import SparseFit
 from soundmap.geometry import FloatArray
 
@@ -85,9 +85,10 @@ def derivatives(fit: SparseFit, owners: Sequence[Owner], scans: slice) -> Single
         The unknowns, those of a component one after the other.
     scans : slice
     """
-    evidence, table = fit.evidence, fit.evidence.table
+    evidence = fit.evidence
     components = list(dict.fromkeys(component for component, _ in owners))
     paths = [component.paths for component in components]
+    strength = np.array([component.strength for component in components])
     part_of = np.zeros((len(components), len(paths[0].gain)))
     for component, parts in zip(components, part_of, strict=True):
         chosen, share = component.taken()
@@ -101,21 +102,13 @@ def derivatives(fit: SparseFit, owners: Sequence[Owner], scans: slice) -> Single
         told,
         np.array([components.index(component) for component, _ in owners]),
         np.array([axis for _, axis in owners]),
-        part_of,
         of_share,
+        waves_to(evidence, paths, strength, scans),
+        part_of,
         np.array([component.place_m for component in components]),
-        np.array([component.strength for component in components]),
         fit.walls,
         evidence.place_m[scans],
         float(evidence.handedness),
-        np.stack([each.wave[:, scans] for each in paths]),
-        np.stack([each.aperture[:, scans] for each in paths]),
-        np.stack([each.gain[:, scans] for each in paths]),
-        table.beams,
-        table.turned,
-        table.starts,
-        evidence.turn[scans],
-        evidence.weight[scans],
     )
     return told
 
@@ -125,25 +118,17 @@ def _add_changes(
     out: Single,
     number: NDArray[np.int64],
     axes: NDArray[np.int64],
-    part_of: FloatArray,
     of_share: NDArray[np.bool_],
+    waves: Waves,
+    part_of: FloatArray,
     place: FloatArray,
-    strength: FloatArray,
     walls: FloatArray,
     stand: FloatArray,
     hand: float,
-    wave: FloatArray,
-    aperture: FloatArray,
-    gain: FloatArray,
-    beams: Single,
-    turned: Single,
-    starts: NDArray[np.int64],
-    turn: FloatArray,
-    weight: FloatArray,
 ) -> None:
     """Derivatives (U, s, D), path by path.
 
-    Of U unknowns, ``number`` is that of the component, ``of_share`` (U, P) tells the paths that
+    Of U unknowns, ``number`` is that of the component, and ``of_share`` (U, P) tells the paths that
     have the share. ``part_of`` (C, P) is the part of a component's power that takes a path.
     """
     beam, turning = np.empty(out.shape[2], np.float32), np.empty(out.shape[2], np.float32)
@@ -154,16 +139,15 @@ def _add_changes(
         while last < len(number) and number[last] == c:
             last += 1
         for s in range(len(stand)):
-            for b in range(len(starts) - 1):
-                noise[starts[b] : starts[b + 1]] = weight[s, b] * strength[c, b]
+            weigh(noise, waves, c, s)
             for p in range(part_of.shape[1]):
-                part, loud = part_of[c, p], gain[c, p, s]
+                part, loud = part_of[c, p], waves.gain[c, p, s]
                 if loud == 0.0 or (part == 0.0 and not of_share[first:last, p].any()):
                     continue
+                at, cos, turn = waves.wave[c, p, s], waves.aperture[c, p, s], waves.turn[s]
+                look_up(beam, waves.beams, noise, at, cos, turn)
+                look_up(turning, waves.turned, noise, at, cos, turn)
                 dx, dy, sense = place[c, 0] - stand[s, 0], place[c, 1] - stand[s, 1], hand
-                at, cos = wave[c, p, s], aperture[c, p, s]
-                look_up(beam, beams, noise, at, cos, turn[s])
-                look_up(turning, turned, noise, at, cos, turn[s])
                 if p >= Path.WALLS:  # the way to the source in the mirror, mirrored back
                     nx, ny, offset = walls[p - Path.WALLS]
                     off = nx * stand[s, 0] + ny * stand[s, 1] - offset
