@@ -57,15 +57,16 @@ class FarField:
             inverse[slice(*own), slice(*own)] = np.linalg.inv(turning.normal(weights))
         return inverse
 
-    def pull(self, weighted: Single, scans: slice = slice(None)) -> FloatArray:
-        r""":math:`\sum_s A_s^T` times columns (..., s, D) of some scans, shape (..., D)."""
-        bands = zip(self._bands, pairwise(self.starts), strict=True)
-        return np.concatenate(
-            [turning.pull(weighted[..., slice(*own)], scans) for turning, own in bands], axis=-1
-        ).astype(np.float64)
+    def pull(self, weighted: Single) -> FloatArray:
+        r""":math:`\sum_s A_s^T` times columns (..., S, D), shape (..., D)."""
+        told = [
+            self.pull_band(band, weighted[..., slice(*own)], slice(None))
+            for band, own in enumerate(pairwise(self.starts))
+        ]
+        return np.concatenate(told, axis=-1).astype(np.float64)
 
     def pull_band(self, band: int, weighted: Single, scans: slice) -> Single:
-        """The same of one sub-band, columns (..., s, d) to (..., d)."""
+        """The same of one sub-band and some scans, columns (..., s, d) to (..., d)."""
         return self._bands[band].pull(weighted, scans)
 
     def pulls(self, weighted: Single) -> Single:

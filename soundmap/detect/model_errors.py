@@ -132,17 +132,16 @@ class Precision:
 
         side_by_side(invert, parts(len(evidence)))
 
-    def times(self, columns: Single, scans: slice = slice(None)) -> Single:
-        r""":math:`\Sigma^{-1}` of some scans times columns (..., S, D)."""
+    def times(self, columns: Single) -> Single:
+        r""":math:`\Sigma^{-1}` times columns (..., S, D)."""
         out = np.empty_like(columns)
         flat, result = columns.reshape(-1, *columns.shape[-2:]), out.reshape(-1, *out.shape[-2:])
-        inverses = [inverse[scans] for inverse in self.inverse]
 
-        def multiply(few: slice) -> None:
-            for band, inverse in enumerate(inverses):
+        def multiply(scans: slice) -> None:
+            for band, inverse in enumerate(self.inverse):
                 own = slice(self.starts[band], self.starts[band + 1])
-                part, into = (each[:, few, own].swapaxes(0, 1) for each in (flat, result))
-                np.matmul(part, inverse[few], out=into)  # it is symmetric
+                part, into = (each[:, scans, own].swapaxes(0, 1) for each in (flat, result))
+                np.matmul(part, inverse[scans], out=into)  # it is symmetric
 
         side_by_side(multiply, parts(columns.shape[-2]))
         return out
