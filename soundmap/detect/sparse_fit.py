@@ -30,7 +30,7 @@ from soundmap.detect.sound_paths import (
     sound_paths,
     waves_heard,
 )
-from soundmap.detect.weighted_products import KnownProducts, weighted_products
+from soundmap.detect.weighted_products import KnownProducts, Products, weighted_products
 from soundmap.geometry import FloatArray
 
 LEAST_NOISE = 0.5
@@ -142,9 +142,7 @@ class SparseFit:
         r""":math:`\Sigma^{-1}` times the column of a component, shape (S, D)."""
         return self.precision.times(self.components[index].column)
 
-    def products(
-        self, columns: Callable[[slice], Single], others: Sequence[Single]
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def products(self, columns: Callable[[slice], Single], others: Sequence[Single]) -> Products:
         """`weighted_products` as this fit weighs scans."""
         return weighted_products(self.precision, self.far_field, columns, others)
 

@@ -38,7 +38,7 @@ def unknowns(
 ) -> list[Owner]:
     """Places, shares and, if they are ``directed``, directivities of those that enough scans hear.
 
-    Mirror images have no directivity: what they mirror is not known.
+    Or ``only_places`` of them. Mirror images have no directivity: what they mirror is not known.
     """
     owners: list[Owner] = []
     for component in chosen:

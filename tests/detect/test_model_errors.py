@@ -8,11 +8,11 @@ import pytest
 from soundmap.config import ScanConfig
 from soundmap.detect.component import Share
 from soundmap.detect.evidence import gathered_evidence
-from soundmap.detect.model_errors import ComponentErrors, Precision
+from soundmap.detect.model_errors import APERTURE_ERROR, ComponentErrors, Precision
 from soundmap.detect.sound_paths import Kind, Path, waves_heard
 from soundmap.detect.sparse_fit import SparseFit
 from soundmap.detect.unknowns import derivatives
-from tests.detect.box_room import observed
+from tests.detect.box_room import begun_fit, observed
 
 
 @pytest.fixture(scope="module")
@@ -67,3 +67,34 @@ def test_what_may_be_louder_or_not_tells_less(fit, path, errors):
     heard = waves_heard(fit.evidence, paths.wave[path], paths.aperture[path], paths.gain[path])
     heard *= strength[fit.evidence.table.part].astype(np.float32)
     assert np.sum(heard * free.times(heard)) < 0.9 * np.sum(heard * usual.times(heard))
+
+
+def test_what_errors_may_add_counts_no_more_than_chance_does():
+    """Along every path, and with its bearing and elevation."""
+    fit = begun_fit([(5.5, 3.1, 200.0)], reflected=0.5)
+    component = fit.add(np.array([5.5, 3.1]), 0.1, Kind.SOURCE)
+    fit.refit()
+    evidence, paths, usual = fit.evidence, component.paths, ComponentErrors()
+    part = evidence.table.part
+
+    def heard(path, lowered=0.0, *, turned=False):
+        own = paths.wave[path], paths.aperture[path] - lowered, paths.gain[path]
+        return component.strength[part] * waves_heard(evidence, *own, turned=turned)
+
+    walls = [path for path in range(Path.WALLS, len(paths.gain)) if paths.gain[path].any()]
+    assert walls
+    modes = [usual.reflection * heard(path) for path in (Path.FLOOR, *walls)]
+    modes.append(usual.strength * heard(Path.DIRECT))
+    bearing = usual.bearing * evidence.table.width_rad[part]
+    modes.append(bearing * heard(Path.DIRECT, turned=True))
+    modes.append(heard(Path.DIRECT) - heard(Path.DIRECT, APERTURE_ERROR))
+    precision = Precision(evidence, fit.components)
+    for mode in modes:
+        single = mode.astype(np.float32)
+        starts = evidence.table.starts[:-1]
+        counted, alone = (
+            np.add.reduceat(single * other, starts, axis=1)
+            for other in (precision.times(single), single)
+        )
+        assert counted.max() < 1.01
+        assert alone.max() > 2.0

@@ -73,3 +73,18 @@ def test_the_far_field_is_taken_out_of_the_equations_of_places():
         size_of = scale * np.linalg.norm(column[:, part])
         np.testing.assert_allclose(hessian[:count, count + band] / size_of, across / size_of,
                                    atol=2e-4)  # fmt: skip
+
+
+def test_only_places_move_if_nothing_else_shall():
+    fit = begun_fit([(5.5, 3.1, 20.0, (0.0, -0.8))], reflected=0.8)
+    source = fit.add(np.array([5.4, 3.0]), 0.3, Kind.SOURCE)
+    fit.directed = True
+    fit.refit()
+    shares, place = dict(source.shares), source.place_m.copy()
+    move(fit, only_places=True)
+    assert np.hypot(*(source.place_m - place)) > 0.01
+    assert source.shares == shares
+    assert not source.directivity.any()
+    move(fit)
+    assert source.shares != shares
+    assert source.directivity.any()
